@@ -56,6 +56,7 @@ GONE: Mapping[str, str] = {
     "mapper.skip_tiles": "it gained nothing that could be measured",
     "mapper.map_views": "it was for mvs=skipping",
     "mapper.insertion.min_confidence": "depth comes filtered already",
+    "mapper.training.frequency_horizon": "the frequency goes through the whole training, however long it is",
     "mapper.training.exposure_rate": "exposures are the tracker's: training them further gained nothing",
     **{
         f"{path}.{name}": why

@@ -23,8 +23,12 @@ def tracker_file(output: Path | str) -> Path:
 
 
 def check_no_map(output: Path | str) -> None:
-    """Raises ValueError, saying what to do, for a directory that has a map already: none is written over."""
-    if (Path(output) / FOLDER).exists():
+    """Raises ValueError, saying what to do, for a directory that has a map already: none is written over.
+
+    The tracker's half alone is none: who wrote it was killed before the other was there.
+    """
+    folder = Path(output) / FOLDER
+    if folder.is_dir() and any(file.name != TRACKER for file in folder.iterdir()):
         raise ValueError(f"{output}: there is a map already; give another folder")
 
 

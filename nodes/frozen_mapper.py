@@ -20,6 +20,7 @@ from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mapping.preview import preview_arrays, seen
 from mvsgs_core.stats import Stats
 from nodes import Node
+from nodes.once import Once
 from nodes.splat_map import splat_map
 
 NEWEST = 8  # frames that wait for their poses, to be shown
@@ -45,6 +46,7 @@ class FrozenMapper(Node):
         super().__init__(config)
         self.check(self.config)
         self.atlas = begin_on(Path(self.config.map or ""), self.config, Stats())
+        self._once = Once(self.stats)
         self._found: Counter[int] = Counter()  # frames in each part of the map
         self._frames: dict[int, Frame] = {}
         self._last_preview = 0.0
@@ -73,6 +75,8 @@ class FrozenMapper(Node):
             yield self._preview(pose, frame)
 
     def on_request(self, request: Request) -> Iterator[Reply]:
+        if not self._once.request(request):
+            return
         said, problem = "it localizes", request.problem
         if request.asked == Asked.PAUSE:
             said = "paused" if request.on else "the stream goes on"

@@ -101,6 +101,8 @@ class Returning:
         before, self._file = self._file, self._file_of(request)
         self._changed, self._due = True, 0.0
         self.save(tracker)
+        if tracker.mapped and not self._file.exists():
+            self._give_up("the map that was begun could not be saved")
         self._write(f"{ANOTHER} {request} {first}")
         before.unlink(missing_ok=True)
 
@@ -128,10 +130,14 @@ class Returning:
             with self._log.open("a") as log:
                 log.write(f"\n{line};")  # begins a line: one that was cut off stays by itself
         except OSError as error:
-            self._lost = True
             self._file.unlink(missing_ok=True)  # it makes room, and is of no use without the log
-            self._gap.touch()
-            self._stats.warn(f"if this tracker is killed it cannot go on: {error}")
+            self._give_up(str(error))
+
+    def _give_up(self, why: str) -> None:
+        """Who returns is told that it cannot go on."""
+        self._lost = True
+        self._gap.touch()
+        self._stats.warn(f"if this tracker is killed it cannot go on: {why}")
 
 
 __all__ = ["Returning"]

@@ -150,7 +150,8 @@ class Ros2Publisher(Node):
 
     def on_request(self, request: Request) -> Iterator[None]:
         """From the tracker, in its place among the poses: those that follow are of another map."""
-        if not request.problem and request.asked in (Asked.RESET, Asked.LOAD_MAP):
+        new = request.number > self._awaited  # a tracker that was started again sends the last one once more
+        if new and not request.problem and request.asked in (Asked.RESET, Asked.LOAD_MAP):
             self._begin()
             self._awaited = request.number
             nothing = np.zeros((0, 3))

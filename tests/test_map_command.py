@@ -167,8 +167,11 @@ def test_what_was_found_in_one_map_says_nothing_of_the_next(tmp_path: Path) -> N
     assert isinstance(refused, Reply)
     assert not refused.success
     assert node._mapper is node.atlas.parts[0], "the map is still that one"
-    list(node.on_request(Request(2, Asked.LOAD_MAP, folder=str(tmp_path))))
+    assert len(list(node.on_request(Request(2, Asked.LOAD_MAP, folder=str(tmp_path))))) == 1
     assert not list(node.on_camera_pose(CameraPose(0, 0.5, given.world_from_cam, 1, None, 0.9))), "an older frame"
+    assert node._mapper is node.atlas.parts[1]
+    again = list(node.on_request(Request(2, Asked.LOAD_MAP, folder=str(tmp_path))))
+    assert not again, "by a tracker that was started again"
     assert node._mapper is node.atlas.parts[1]
 
 

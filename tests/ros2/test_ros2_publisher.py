@@ -297,6 +297,9 @@ def test_another_map_takes_the_points_away_and_odometry_goes_on(peer: Peer, aske
     send(graph.node.on_reply(Reply(7, True, "")))
     send(graph.node.on_preview(preview(means, opacities, iterations=3)))
     assert graph.taken("points")[0]["width"] == 4
+    send(graph.node.on_request(Request(7, asked)))  # once more, by a tracker that was started again
+    graph.none("points")
+    assert 2 in graph.node._keyframes
     send(graph.node.on_reply(Reply(8, True, "")))  # before the request itself came from the tracker
     send(graph.node.on_request(Request(8, asked)))
     assert graph.taken("points")[0]["width"] == 0
