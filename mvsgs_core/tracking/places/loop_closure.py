@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 
@@ -14,10 +13,8 @@ from mvsgs_core.tracking.local_map import LocalMap
 from mvsgs_core.tracking.places.geometric_verification import PlaceMatch, relative_scale, verifying_place
 from mvsgs_core.tracking.places.pose_criteria import PoseCriteria
 from mvsgs_core.tracking.places.retrieval import Retrieval
-from mvsgs_core.tracking.places.thinning import solve_thinned
+from mvsgs_core.tracking.places.thinning import UNMATCHED, joining, solve_thinned
 from mvsgs_core.tracking.steps import Steps, whole
-
-UNMATCHED = 1e3  # times as loose: neighbors in the stream that no match ties, as where the camera was lost between them
 
 
 @dataclass(frozen=True)
@@ -119,11 +116,12 @@ class LoopCloser:
         poses = np.stack([self.graph.keyframes[k].cam_from_world for k in order])
         unit = float(np.median([self.graph.keyframes[k].median_depth for k in order]))
         tied = self.graph.edges.of(order)
-        matched = {(min(a, b), max(a, b)) for a, b in tied if a in number and b in number}
-        pairs = sorted(matched | set(pairwise(order)))
-        source, to = np.array([(number[a], number[b]) for a, b in pairs]).T
+        matched = {(number[min(a, b)], number[max(a, b)]) for a, b in tied if a in number and b in number}
+        unmatched = joining(len(order), matched)
+        pairs = sorted(matched | unmatched)
+        source, to = np.array(pairs).T
         sigma = np.tile([0.01 * unit, 0.005, 0.01], (len(pairs) + 1, 1))
-        sigma[[n for n, pair in enumerate(pairs) if pair not in matched]] *= UNMATCHED
+        sigma[[n for n, pair in enumerate(pairs) if pair in unmatched]] *= UNMATCHED
         edges = SimilarityEdges(
             source=np.append(source, number[found.index]),
             to=np.append(to, number[index]),

@@ -22,6 +22,7 @@ from mvsgs_core.tracking.estimation.pose_graph import (
 
 MAX_NODES = 300  # keyframes that are solved as they are
 THINNED = 150  # that are solved for of more
+UNMATCHED = 1e3  # times as loose: neighbors in the stream that no match ties, as where the camera was lost between them
 
 
 def solve_thinned(poses: np.ndarray, edges: SimilarityEdges) -> PoseGraphSolution:
@@ -32,8 +33,8 @@ def solve_thinned(poses: np.ndarray, edges: SimilarityEdges) -> PoseGraphSolutio
     count = len(poses)
     if count <= MAX_NODES:
         return solve_pose_graph(poses, edges, {0})
-    loose = _loose(edges)
-    ends = [edges.source[-1:], edges.to[-1:], edges.source[:-1][loose], edges.to[:-1][loose]]
+    loose = np.flatnonzero(_loose(edges))[-(MAX_NODES - THINNED) // 2 :]
+    ends = [edges.source[-1:], edges.to[-1:], edges.source[loose], edges.to[loose]]
     nodes = thinned(count, {int(end) for end in np.concatenate(ends)})
     solution = solve_pose_graph(poses[nodes], _between(poses, edges, nodes), {0})
     if solution.failure or not np.isfinite(solution.similarities).all():
@@ -47,6 +48,20 @@ def thinned(count: int, kept: set[int]) -> np.ndarray:
     return np.array(sorted({*even, *kept}))
 
 
+def joining(count: int, matched: set[tuple[int, int]]) -> set[tuple[int, int]]:
+    """Steps of `count` keyframes in the order of the stream that join what no pair of `matched` ties together."""
+    group = np.arange(count)
+    for a, b in matched:
+        if group[a] != group[b]:
+            group[group == group[b]] = group[a]
+    steps = set()
+    for a, b in pairwise(range(count)):
+        if group[a] != group[b]:
+            group[group == group[b]] = group[a]
+            steps.add((a, b))
+    return steps
+
+
 def _loose(edges: SimilarityEdges) -> np.ndarray:
     """(E - 1,) bool: the steps that nobody measured, whose sigma is larger. Nodes stand on both sides of each."""
     return np.asarray(edges.sigma[:-1, 0] > edges.sigma[:-1, 0].min())
@@ -57,15 +72,16 @@ def _between(poses: np.ndarray, edges: SimilarityEdges, nodes: np.ndarray) -> Si
     # An edge counts for the nodes that its ends are nearest to.
     middles = 0.5 * (nodes[1:] + nodes[:-1])
     source, to = (np.searchsorted(middles, ends[:-1]) for ends in (edges.source, edges.to))
-    sigma = edges.sigma[:-1].min(axis=0)
-    of = {step: sigma * np.sqrt(nodes[step[1]] - nodes[step[0]]) for step in pairwise(range(len(nodes)))}
-    for loose in (True, False):  # what was measured replaces what was not
-        for n in np.flatnonzero(_loose(edges) == loose):
-            a, b = int(source[n]), int(to[n])
-            if a != b:
-                steps = nodes[b] - nodes[a] if b - a == 1 else len(poses) / len(nodes)
-                of[a, b] = edges.sigma[n] * np.sqrt(steps)
-    pairs = sorted(of)
+    sigma, tight = edges.sigma[:-1].min(axis=0), ~_loose(edges)
+    measured = np.zeros(len(poses), bool)  # of each keyframe: the step that begins there
+    measured[edges.source[:-1][tight & (edges.to[:-1] - edges.source[:-1] == 1)]] = True
+    variance = {}  # by nodes, over that of one step
+    for n, (a, b) in enumerate(pairwise(nodes.tolist())):
+        variance[n, n + 1] = (b - a) * (1.0 if measured[a:b].all() else UNMATCHED**2)
+    for n, m in zip(source[tight].tolist(), to[tight].tolist()):
+        if n != m:
+            variance[n, m] = nodes[m] - nodes[n] if m - n == 1 else len(poses) / len(nodes)
+    pairs = sorted(variance)
     a, b = np.array(pairs).T
     relative = poses[nodes[b]] @ geometry.inverse(poses[nodes[a]])
     loop = [int(np.searchsorted(nodes, end[-1])) for end in (edges.source, edges.to)]
@@ -73,7 +89,7 @@ def _between(poses: np.ndarray, edges: SimilarityEdges, nodes: np.ndarray) -> Si
         source=np.append(a, loop[0]),
         to=np.append(b, loop[1]),
         relative=np.concatenate([relative, edges.relative[-1:]]),
-        sigma=np.concatenate([[of[pair] for pair in pairs], edges.sigma[-1:]]),
+        sigma=np.concatenate([sigma * np.sqrt([[variance[pair]] for pair in pairs]), edges.sigma[-1:]]),
     )
 
 
@@ -96,4 +112,4 @@ def follow(poses: np.ndarray, nodes: np.ndarray, solved: np.ndarray) -> np.ndarr
     return np.asarray(step @ beside_first)
 
 
-__all__ = ["follow", "solve_thinned", "thinned"]
+__all__ = ["UNMATCHED", "follow", "joining", "solve_thinned", "thinned"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +15,12 @@ from mvsgs_core.tracking import local_map, photometer
 from mvsgs_core.tracking.back_end import BackEnd, BackEndConfig
 from mvsgs_core.tracking.edges import Edge, Edges
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solution
-from mvsgs_core.tracking.estimation.pose_graph import SimilarityEdges, scale_of, solve_pose_graph
+from mvsgs_core.tracking.estimation.pose_graph import (
+    PoseGraphSolution,
+    SimilarityEdges,
+    scale_of,
+    solve_pose_graph,
+)
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.local_map import LocalMap, LocalMapConfig
@@ -217,6 +223,32 @@ def test_thinned_pose_graph_gives_a_step_that_nobody_measured_the_loops_error(
     before, after = (np.linalg.norm(places(s) - places(true), axis=1).max() for s in (poses, thin.similarities))
     assert not thin.failure
     assert (after < 0.05 * before) != reached_across  # where an edge reaches across, it is a step as any other
+
+
+def test_a_thinned_pose_graph_is_small_however_many_steps_nobody_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    true, poses, edges = drifting(900, 1.3)
+    edges.sigma[1:-1:3] *= 1e3
+    solved: list[int] = []
+
+    def spied(poses: np.ndarray, *rest: Any) -> PoseGraphSolution:
+        solved.append(len(poses))
+        return solve_pose_graph(poses, *rest)
+
+    monkeypatch.setattr(thinning, "solve_pose_graph", spied)
+    thin = thinning.solve_thinned(poses, edges)
+    assert not thin.failure
+    assert max(solved) <= thinning.MAX_NODES
+    assert (
+        np.linalg.norm(places(thin.similarities) - places(true), axis=1).max()
+        < 0.5 * np.linalg.norm(places(poses) - places(true), axis=1).max()
+    )
+
+
+def test_neighbors_that_no_match_ties_are_joined_only_where_nothing_else_does() -> None:
+    """Else what lies between them is known without them, and was never measured."""
+    assert thinning.joining(6, {(0, 1), (1, 2), (3, 4), (4, 5)}) == {(2, 3)}
+    assert thinning.joining(6, {(0, 1), (1, 2), (3, 4), (4, 5), (0, 5)}) == set()
+    assert thinning.joining(3, set()) == {(0, 1), (1, 2)}
 
 
 def disturbed() -> KeyframeGraph:
