@@ -46,6 +46,7 @@ class GaussianMap:
     cameras: Cameras | None  # None: a map.ply without cameras.json
     source: SourceCamera | None = None  # the camera that took the stream; None: not known
     file: Path | None = None  # that it was loaded from; None: none
+    sources: tuple[Path, ...] = ()  # files that it comes from: `export` replaces none of them
 
     @classmethod
     def load(cls, path: str | Path, *, drop_unsound: bool = False, antialiased: bool | None = None) -> GaussianMap:
@@ -58,9 +59,10 @@ class GaussianMap:
         snapshot, _ = sound_map(file, drop_unsound, antialiased, "drop_unsound=True")
         beside = file.with_name(CAMERAS)
         if not beside.is_file():
-            return cls(snapshot, None, file=file)
+            return cls(snapshot, None, file=file, sources=(file,))
         cameras = read_cameras(beside)
-        return cls(snapshot, cameras if len(cameras) else None, read_source_camera(beside), file)
+        camera = read_source_camera(beside)
+        return cls(snapshot, cameras if len(cameras) else None, camera, file, (file, beside))
 
     def __len__(self) -> int:
         """Number of splats."""
@@ -98,7 +100,8 @@ class GaussianMap:
         not known; OSError.
         """
         out = Path(path).expanduser()
-        self._check_not_loaded(out)
+        if out.resolve() in [source.resolve() for source in self.sources]:
+            raise ValueError(f"{out} is what this map was loaded from: give another file")
         if out.suffix == ".ply":
             write_ply(out, self.snapshot, fold=fold)
         elif out.suffix in SPLATS:
@@ -119,13 +122,6 @@ class GaussianMap:
             there = ", ".join((".ply", *SPLATS, *MESHES, ".json"))
             raise ValueError(f"{out}: no format {out.suffix!r}; there are: {there}, a folder")
         return out
-
-    def _check_not_loaded(self, out: Path) -> None:
-        if self.file is None:
-            return
-        loaded = [self.file, *([] if self.cameras is None else [self.file.with_name(CAMERAS)])]
-        if out.resolve() in [path.resolve() for path in loaded]:
-            raise ValueError(f"{out} is what this map was loaded from: give another file")
 
     def _keyframes(self, out: Path) -> Cameras:
         if self.cameras is None:

@@ -39,8 +39,8 @@ from msgs import CameraPose, FusedKeyframe, Keyframe, Poses, Preview, TrackerPha
 from msgs import Trajectory as TrajectoryMessage
 from mvsgs.fed import Fed
 from mvsgs.frames import Frames, Numbers
-from mvsgs.gaussian_map import GaussianMap, View
-from mvsgs.saving import save_map
+from mvsgs.gaussian_map import CAMERAS, GaussianMap, View
+from mvsgs.saving import images_before, save_map
 from mvsgs_core.datasets.framing import Size
 from mvsgs_core.export.source_camera import LENS, lens_values, source_camera
 from mvsgs_core.kept_map import check_kept_map, tracker_file
@@ -117,8 +117,9 @@ class Mapping:
         """
         self._lock = threading.RLock()
         self._frames = Frames(intrinsics, distortion, fisheye, size, poses)
+        self._loaded = None if map is None else Path(map).expanduser().absolute()
         words = [*FIXED, *(["tracker=ground_truth"] if poses else []), *(["keep_map=true"] if map is not None else [])]
-        words += [] if map is None else [f"map={quoted(str(Path(map).expanduser().absolute()))}"]
+        words += [] if self._loaded is None else [f"map={quoted(str(self._loaded))}"]
         words += [] if loss is None else [f"mapper.training.loss_function={quoted(name_of(loss))}"]
         for word in settings:
             _check_setting(word)
@@ -143,6 +144,8 @@ class Mapping:
         self._new: list[int] = []  # keyframes that it brought
         self._keyframes: dict[int, PosedKeyframe] = {}
         self._came: dict[int, Tensor] = {}  # images of keyframes that are trained on another one
+        if self._loaded is not None and isinstance(mapper, Mapper):
+            self._came = images_before(self._loaded, self._atlas)
         self._trajectory: Trajectory | None = None  # once the stream is over
         self._map: GaussianMap | None = None  # as it is now, where somebody has asked for it
         self._over = ""  # why no frame is taken any more
@@ -241,19 +244,21 @@ class Mapping:
 
         images: each keyframe's image, too; `warnings` says how many could not be. An earlier save there is replaced.
         Raises OSError; ValueError for the output of a run and for a folder where files of others would be replaced,
-        RuntimeError where there is no map yet.
+        RuntimeError where there is no map yet, or nothing new since it was loaded.
         """
         with self._lock:
             self._check_map()
             if not isinstance(self._mapper, Mapper):
                 raise RuntimeError("mapper=frozen leaves the map as it is: there is nothing new to save")
             path, node = Path(folder).expanduser(), self._graph.nodes["tracker"]
+            if isinstance(node, Tracker) and not node.core.mapped:
+                raise RuntimeError("no frame has come since the map was loaded: there is nothing new to save")
             source, track = source_camera(self.statistics), self._trajectory and self.trajectory
             if left_out := save_map(path, self._atlas, source, track, images, self._came):
                 self._mapper.stats.warn(
                     f"{left_out} of {len(self._atlas.largest.views)} keyframes were saved without an image: it was let "
-                    "go (mapper.max_keyframes), found no room on the disk, or is of a stream before and as its rolling "
-                    "shutter took it"
+                    "go (mapper.max_keyframes), found no room on the disk, or is of a stream before that was saved "
+                    "without images, and smaller (mapper.max_pixels) or as its rolling shutter took it"
                 )
             if isinstance(node, Tracker):
                 node.core.keep_map(tracker_file(path))
@@ -272,7 +277,9 @@ class Mapping:
             if self._map is None:
                 shown = self._atlas.largest
                 snapshot = shown.snapshot()
-                self._map = GaussianMap(snapshot, cameras_of(snapshot, shown.views), source_camera(self.statistics))
+                cameras, source = cameras_of(snapshot, shown.views), source_camera(self.statistics)
+                loaded = () if self._loaded is None else tuple(self._loaded / name for name in ("map.ply", CAMERAS))
+                self._map = GaussianMap(snapshot, cameras, source, sources=loaded)
             return self._map
 
     @property

@@ -6,17 +6,18 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from torch import Tensor
+from torch import Tensor, from_numpy
 
 from mvsgs_core.atomic_file import replacing
 from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.cameras import read_cameras, write_cameras
 from mvsgs_core.export.source_camera import SourceCamera
-from mvsgs_core.kept_map import FOLDER
+from mvsgs_core.kept_map import FOLDER, STREAM, tracker_file
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.results import cameras_of, write_results
 from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.mapping.keyframes import TrainingView
+from mvsgs_core.mapping.resting_images import on_disk
 from mvsgs_core.trajectory import Trajectory
 from mvsgs_core.trajectory_file import write_trajectory
 
@@ -40,47 +41,64 @@ def save_map(
     if (folder / "report.json").exists():
         raise ValueError(f"{folder}: is the output of a run, with its report; save to another folder")
     earlier = _saved_keyframes(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    (folder / FOLDER).mkdir(parents=True, exist_ok=True)
     shown = atlas.largest
     if earlier is None:  # first of all, so that what is cut off is known as a save
         write_cameras(folder / CAMERAS, cameras_of(shown.snapshot(), shown.views), source)
+    tracker_file(folder).unlink(missing_ok=True)  # of the map before: no half of this one
     CheckpointWriter(folder, shown.config).write(atlas.frozen())
-    pictures, left_out = folder / keyframe_images.FOLDER, 0
-    _remove_images(folder, earlier or [])
-    for view in shown.views if images else ():
-        image = _image(view, came or {})
-        if image is None:
-            left_out += 1
-        else:
-            keyframe_images.write_image(pictures, view.index, image.cpu().numpy())
+    written = _write_images(folder, shown.views if images else [], came or {})
+    _remove_images(folder, set(earlier or []) - written)
     write_results(folder, shown, source=source)
+    if not written:  # it would name images that are not there
+        (folder / TRANSFORMS).unlink(missing_ok=True)
     if trajectory is not None:
         with replacing(folder / "trajectory.txt") as aside:
             mapped = trajectory.main([view.index for view in shown.views])
             write_trajectory(aside, trajectory.timestamp[mapped], trajectory.world_from_cam[mapped])
-    return left_out
+    return len(shown.views) - len(written) if images else 0
+
+
+def images_before(folder: Path, atlas: Atlas) -> dict[int, Tensor]:
+    """Of the map in `folder`, which `atlas` begins on: images (H, W, 3) uint8 of keyframes that are trained on another
+    one, by index; without those that are not there, or find no room on the disk."""
+    found, pictures = {}, folder / keyframe_images.FOLDER
+    for view in (view for part in atlas.parts.values() for view in part.views if _image(view, {}) is None):
+        image = keyframe_images.known_image(pictures, view.index + STREAM)
+        if image is not None and image.shape[:2] == view.image_size:
+            with suppress(OSError):
+                found[view.index] = on_disk(from_numpy(image))
+    return found
 
 
 def _saved_keyframes(folder: Path) -> list[int] | None:
     """Of the map that was saved there; None: none was. Raises ValueError for names of a save's that are others'."""
     there = [name for name in RESULTS if (folder / name).exists()]
-    if not there:
+    kept = folder / FOLDER
+    if not there or (there == [FOLDER] and kept.is_dir() and not any(kept.iterdir())):  # the latter: cut off at once
         return None
-    try:
-        return read_cameras(folder / CAMERAS).keyframes.tolist()
-    except (OSError, ValueError):
-        raise ValueError(
-            f"{folder}: {', '.join(there)} is there and was left by no save of a map; save to another folder"
-        ) from None
+    with suppress(OSError, ValueError):
+        if kept.is_dir():  # who exports leaves cameras.json, too, and no checkpoint
+            return read_cameras(folder / CAMERAS).keyframes.tolist()
+    raise ValueError(f"{folder}: {', '.join(there)} is there and was left by no save of a map; save to another folder")
 
 
-def _remove_images(folder: Path, keyframes: list[int]) -> None:
-    """Those of an earlier save, with what names them."""
+def _write_images(folder: Path, views: list[TrainingView], came: Mapping[int, Tensor]) -> set[int]:
+    """The keyframes whose image is there then."""
+    written = set()
+    for view in views:
+        if (image := _image(view, came)) is not None:
+            keyframe_images.write_image(folder / keyframe_images.FOLDER, view.index, image.cpu().numpy())
+            written.add(view.index)
+    return written
+
+
+def _remove_images(folder: Path, keyframes: set[int]) -> None:
+    """Those of an earlier save."""
     for index in keyframes:
         (folder / keyframe_images.FOLDER / keyframe_images.image_name(index)).unlink(missing_ok=True)
-    with suppress(OSError):  # images of others are there, or none
+    with suppress(OSError):  # there is none, or there are images in it
         (folder / keyframe_images.FOLDER).rmdir()
-        (folder / TRANSFORMS).unlink(missing_ok=True)
 
 
 def _image(view: TrainingView, came: Mapping[int, Tensor]) -> Tensor | None:
@@ -93,4 +111,4 @@ def _image(view: TrainingView, came: Mapping[int, Tensor]) -> Tensor | None:
     return view.image
 
 
-__all__ = ["save_map"]
+__all__ = ["images_before", "save_map"]

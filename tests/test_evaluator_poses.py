@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from launch.summary import _figures
-from msgs import GroundTruth, Trajectory
+from msgs import FusedKeyframe, GroundTruth, Trajectory
+from mvsgs_core.mapping.preview import as_bytes
 from nodes.evaluator import Evaluator
+from nodes.splat_map import snapshot_of
 from tests.support.evaluated_wall import INTRINSICS, ORIGIN, SCALE, H, N, W, poses_along, splat_map_of, wall_evaluator
 
 INDEX = np.arange(N)
@@ -98,3 +100,39 @@ def test_frames_that_never_reached_the_tracker_are_said(tmp_path: Path) -> None:
     list(node.on_trajectory(track(INDEX % 3 == 0)))
     list(node.on_splat_map(splat_map_of(True)))
     assert f"2 of {N + 2} frames are not in the tracker's Trajectory: no figure is of them" in ended(node)["notes"]
+
+
+def textured_wall_report(folder: Path, trajectory: Trajectory | None, views: np.ndarray) -> dict[str, Any]:
+    """Of a stream whose camera is taken for a wider one; `views` are those keyframes that come as they were mapped."""
+    made, given = splat_map_of(True), INTRINSICS * [0.7, 0.7, 1, 1]
+    colors = np.random.default_rng(3).uniform(-1.5, 1.5, made.sh.shape).astype(np.float32)
+    made = replace(made, sh=colors)
+    poses, finished = poses_along(), snapshot_of(made)
+    node = Evaluator(Evaluator.Config(output=str(folder), lpips="off"))
+    depth, normals = np.full((H, W), 2.0, np.float32), np.zeros((H, W, 3), np.float32)
+    for k in range(N):
+        pose = poses[k].copy()
+        pose[:3, 3] += ORIGIN
+        image = as_bytes(finished.render(pose, INTRINSICS, (H, W)).color)
+        list(node.on_ground_truth(GroundTruth(k, k / 30, image, given, None, None)))
+        if k in views:
+            seen = FusedKeyframe(k, k / 30, image, INTRINSICS, pose, 1.0, depth, np.ones_like(depth), normals, 0)
+            list(node.on_fused_keyframe(seen))
+    if trajectory is not None:
+        list(node.on_trajectory(trajectory))
+    list(node.on_splat_map(made))
+    return ended(node)
+
+
+def test_without_a_trajectory_keyframes_are_scored_as_they_were_mapped(tmp_path: Path) -> None:
+    keyframes = splat_map_of(True).keyframes
+    known = replace(track(np.isin(INDEX, keyframes)), focal_factor=1 / 0.7)
+    with_one = textured_wall_report(tmp_path / "a", known, keyframes)["rendering"]["keyframes"]
+    report = textured_wall_report(tmp_path / "b", None, keyframes)
+    assert report["rendering"]["keyframes"]["count"] == with_one["count"] == len(keyframes)
+    assert report["rendering"]["keyframes"]["psnr"] == pytest.approx(with_one["psnr"], abs=0.01)
+    assert with_one["psnr"] > 40
+    assert not any("as they came" in note for note in report["notes"])
+    report = textured_wall_report(tmp_path / "c", None, keyframes[1:])
+    assert report["rendering"]["keyframes"]["psnr"] < with_one["psnr"] - 3
+    assert "1 of 4 keyframes were not received as they were mapped: they are scored as they came" in report["notes"]

@@ -13,6 +13,7 @@ from launch.inline import run_inline
 from msgs import Frame, GroundTruth
 from mvsgs import Mapping
 from mvsgs_core.datasets import Item
+from mvsgs_core.kept_map import STREAM, check_kept_map
 from nodes import Node
 from tests.support.sequences import synthetic
 
@@ -63,3 +64,41 @@ def test_images_that_could_not_be_saved_are_said(tmp_path: Path) -> None:
     mapping.save(saved, images=False)
     assert len(mapping.warnings) == count
     np.testing.assert_array_equal(np.isfinite(mapping.trajectory.world_from_cam).all(axis=(1, 2)), True)
+
+
+def tracked(*more: str) -> Mapping:
+    with Mapping(*SMALL, "tracker.threads=1", *more, intrinsics=room()[0].intrinsics) as mapping:
+        for item in room():
+            mapping.add(item.image, item.timestamp)
+    return mapping
+
+
+@pytest.mark.parametrize("more", ["tracker.readout_time=0.02", "mapper.max_pixels=3072"])
+def test_images_of_a_map_that_is_gone_on_with_are_saved_again(tmp_path: Path, more: str) -> None:
+    """Twice, into the map's own folder: their names change with the frames' numbers."""
+    saved = tracked(more).save(tmp_path / "saved")
+    before = {int(file.stem) - STREAM: file.read_bytes() for file in (saved / "keyframes").iterdir()}
+    assert len(before) > 3
+    again = Mapping.load(saved, *SMALL, more, intrinsics=room()[0].intrinsics)
+    with pytest.raises(RuntimeError, match="no frame has come since the map was loaded"):
+        again.save(saved)
+    with again:
+        again.add(room()[3].image, 0.0)
+    for _ in range(2):
+        again.save(saved)
+        there = {int(file.stem): file.read_bytes() for file in (saved / "keyframes").iterdir()}
+        assert {index: image for index, image in there.items() if index < 0} == before
+        check_kept_map(saved)
+    assert not any("without an image" in line for line in again.warnings)
+
+
+def test_the_map_that_is_gone_on_with_is_not_exported_over(tmp_path: Path) -> None:
+    saved = tracked().save(tmp_path / "saved", images=False)
+    before = {name: (saved / name).read_bytes() for name in ("map.ply", "cameras.json")}
+    again = Mapping.load(saved, *SMALL, intrinsics=room()[0].intrinsics)
+    for name in before:
+        for export in (again.export, again.map.export):
+            with pytest.raises(ValueError, match="is what this map was loaded from: give another file"):
+                export(saved / name)
+    assert {name: (saved / name).read_bytes() for name in before} == before
+    assert again.export(tmp_path / "map.ply").exists()

@@ -9,10 +9,12 @@ import pytest
 from torch import from_numpy
 
 from mvsgs.saving import save_map
-from mvsgs_core.export.cameras import read_cameras
+from mvsgs_core.export.cameras import read_cameras, write_cameras
 from mvsgs_core.export.keyframe_images import image_name, known_image
+from mvsgs_core.kept_map import check_kept_map, tracker_file
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.begun import begin_on
+from mvsgs_core.mapping.checkpoints.results import cameras_of
 from mvsgs_core.stats import Stats
 from mvsgs_core.trajectory import Trajectory
 from tests.support.small_atlas import PLAIN, SIZE, begun, written
@@ -107,3 +109,52 @@ def test_the_trajectory_saved_is_of_the_part_that_is_saved(tmp_path: Path) -> No
     save_map(tmp_path, atlas, None, track, images=False)
     saved = np.loadtxt(tmp_path / "trajectory.txt")
     np.testing.assert_allclose(saved[:, 0], np.flatnonzero(segment == 0) / 30, atol=1e-6)
+
+
+def test_a_map_without_a_tracker_s_half_takes_away_that_of_the_save_before(atlas: Atlas, tmp_path: Path) -> None:
+    save_map(tmp_path, atlas, None, None, images=False)
+    tracker_file(tmp_path).write_bytes(b"of the map before")
+    save_map(tmp_path, atlas, None, None, images=False)
+    with pytest.raises(ValueError, match="no map to begin on there"):
+        check_kept_map(tmp_path)
+
+
+def test_what_was_exported_is_no_save(atlas: Atlas, tmp_path: Path) -> None:
+    shown = atlas.largest
+    write_cameras(tmp_path / "cameras.json", cameras_of(shown.snapshot(), shown.views))
+    (tmp_path / "map.ply").write_bytes(b"of somebody else")
+    (tmp_path / "keyframes").mkdir()
+    (tmp_path / "keyframes" / image_name(0)).write_bytes(b"of somebody else")
+    before = files(tmp_path)
+    with pytest.raises(ValueError, match="was left by no save of a map"):
+        save_map(tmp_path, atlas, None, None, images=True)
+    assert files(tmp_path) == before
+
+
+def test_a_save_that_was_cut_off_at_once_can_be_done_again(atlas: Atlas, tmp_path: Path) -> None:
+    (tmp_path / "checkpoint").mkdir()
+    save_map(tmp_path, atlas, None, None, images=False)
+    assert (tmp_path / "map.ply").exists()
+
+
+def test_transforms_name_no_images_that_are_not_there(atlas: Atlas, tmp_path: Path) -> None:
+    save_map(tmp_path, atlas, None, None, images=True)
+    assert (tmp_path / "transforms.json").exists()
+    (tmp_path / "keyframes/mine.png").write_bytes(b"of somebody else")
+    save_map(tmp_path, atlas, None, None, images=False)
+    assert not (tmp_path / "transforms.json").exists()
+
+
+def test_images_of_the_save_before_stay_until_the_new_ones_are_there(
+    atlas: Atlas, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_map(tmp_path, atlas, None, None, images=True)
+    before = files(tmp_path / "keyframes")
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("mvsgs_core.export.keyframe_images.write_image", full)
+    with pytest.raises(OSError, match="No space left"):
+        save_map(tmp_path, atlas, None, None, images=True)
+    assert files(tmp_path / "keyframes") == before

@@ -147,7 +147,7 @@ class Evaluation:
         if moving is None:
             moving = velocities(tracked.timestamp, tracked.world_from_cam, main)
         exposures = self.exposures(refined)
-        photographs = self._frames.photographs()
+        photographs = self._photographs()
         for k in np.flatnonzero(main & np.isin(tracked.index, list(photographs))):
             index = int(tracked.index[k])
             photograph = self._as_pinhole(photographs[index], tracked)
@@ -183,7 +183,11 @@ class Evaluation:
 
     def photograph(self, index: int) -> np.ndarray:
         """(H, W, 3) uint8, as renders are compared with it. Raises KeyError for a frame that was not kept."""
-        return self._as_pinhole(self._frames.photographs()[index], self.trajectory).image()
+        return self._as_pinhole(self._photographs()[index], self.trajectory).image()
+
+    def _photographs(self) -> dict[int, Photograph]:
+        """Without a Trajectory nothing says what camera took the stream: keyframes are as they were mapped."""
+        return self._frames.photographs(mapped=self.trajectory is None)
 
     def _as_pinhole(self, photograph: Photograph, tracked: Trajectory | None) -> Photograph:
         """Without the distortion that the tracker found: as its keyframes are."""
@@ -297,7 +301,13 @@ class Evaluation:
         """What a user should know of the one that the tracker sent."""
         if self.trajectory is None:
             instead = "" if self.finished is None else ": the map's keyframes are scored, and no other frame"
-            return [f"no trajectory was received{instead}"]
+            found = self._photographs()
+            came = sum(index in found and not found[index].as_mapped for index in self.keyframes.tolist())
+            doubtful = (
+                f"{came} of {len(self.keyframes)} keyframes were not received as they were mapped: they are scored as "
+                "they came"
+            )
+            return [f"no trajectory was received{instead}", *([doubtful] if came else [])]
         notes = []
         if missing := len(self._received - set(self.trajectory.index.tolist())):
             notes.append(

@@ -2,7 +2,8 @@
 
 Held-out frames, all others and keyframes are thinned out each by themselves (`thinning`), so that there are enough of
 each kind; the last frames of the stream are always there, for its end is where maps fail. A keyframe's image comes with
-its depth, as it was mapped: it is scored on the stream's own where that was kept.
+its depth, as it was mapped: it is scored on the stream's own where that was kept and a Trajectory says what camera took
+it.
 """
 
 from __future__ import annotations
@@ -91,20 +92,22 @@ class Frames:
             arrays = {"image": image, "depth": depth} | ({} if mask is None else {"mask": mask})
             self._mapped.add(index, _Mapped(intrinsics, scale), arrays)
 
-    def photographs(self) -> dict[int, Photograph]:
-        """All that can be scored, by index."""
-        found = {
-            index: self._photograph(index, mapped.intrinsics, as_mapped=True)
-            for index, mapped in self._mapped.notes.items()
+    def photographs(self, *, mapped: bool = False) -> dict[int, Photograph]:
+        """All that can be scored, by index. mapped: of a keyframe the image that it was mapped with goes before the
+        stream's own."""
+        of_keyframes = {
+            index: Photograph(
+                partial(self._read_mapped, index), note.intrinsics, True, partial(self._mapped.get, index, "mask")
+            )
+            for index, note in self._mapped.notes.items()
         }
-        streamed = [item for kept in self._streamed.values() for item in kept.notes.items()]
-        streamed += [(index, frame.intrinsics) for index, frame in self._ending.items()]
-        for index, intrinsics in streamed:
-            found[index] = self._photograph(index, intrinsics, as_mapped=False)
-        return found
-
-    def _photograph(self, index: int, intrinsics: np.ndarray, *, as_mapped: bool) -> Photograph:
-        return Photograph(partial(self._read, index), intrinsics, as_mapped, partial(self._mask, index))
+        notes = {index: note for kept in self._streamed.values() for index, note in kept.notes.items()}
+        notes |= {index: frame.intrinsics for index, frame in self._ending.items()}
+        streamed = {
+            index: Photograph(partial(self._read, index), intrinsics, False, partial(self._mask, index))
+            for index, intrinsics in notes.items()
+        }
+        return streamed | of_keyframes if mapped else of_keyframes | streamed
 
     def true_depth(self, index: int) -> tuple[np.ndarray, np.ndarray] | None:
         """(H, W) float32, 0 unknown, as the frame came, and its intrinsics (4,); None where it is not known."""
@@ -154,15 +157,19 @@ class Frames:
         """Of the image that `_read` gives."""
         if index in self._ending:
             return self._ending[index].mask
-        streamed = self._streamed[is_held_out(index)]
-        return (streamed if index in streamed.notes else self._mapped).get(index, "mask")
+        return self._streamed[is_held_out(index)].get(index, "mask")
 
     def _read(self, index: int) -> np.ndarray:
         if index in self._ending:
             return self._ending[index].image
-        image = self._streamed[is_held_out(index)].get(index, "image")
-        if image is None:
-            image = self._mapped.get(index, "image")
-        if image is None:
-            raise KeyError(f"the image of frame {index} was not kept")
-        return image
+        return _kept(self._streamed[is_held_out(index)], index)
+
+    def _read_mapped(self, index: int) -> np.ndarray:
+        return _kept(self._mapped, index)
+
+
+def _kept(frames: Thinned[Any], index: int) -> np.ndarray:
+    image = frames.get(index, "image")
+    if image is None:
+        raise KeyError(f"the image of frame {index} was not kept")
+    return image

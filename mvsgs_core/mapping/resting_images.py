@@ -10,6 +10,7 @@ import math
 import mmap
 import os
 import tempfile
+import threading
 import weakref
 
 import numpy as np
@@ -34,10 +35,10 @@ class _File:
         self._file.truncate(SLOTS * size)  # takes no room yet
         self._mapped = mmap.mmap(self._file.fileno(), SLOTS * size)
 
-    def put(self, plain: np.ndarray) -> Tensor:
-        """Raises OSError where the disk takes no more: written through the mapping, that would end the process."""
-        slot, rest = self.free.pop(), memoryview(plain.tobytes())
-        offset = slot * self.size
+    def put(self, plain: np.ndarray, slot: int) -> Tensor:
+        """Into a slot that was taken from `free`. Raises OSError where the disk takes no more: written through the
+        mapping, that would end the process."""
+        offset, rest = slot * self.size, memoryview(plain.tobytes())
         try:
             while rest:
                 rest = rest[os.pwrite(self._file.fileno(), rest, offset + plain.nbytes - len(rest)) :]
@@ -54,6 +55,7 @@ class _File:
 
 
 _files: weakref.WeakSet[_File] = weakref.WeakSet()  # of this process; they live as long as an image in them does
+_TAKING = threading.Lock()  # a slot: two maps in one program have a thread each
 
 
 def on_disk(image: Tensor) -> Tensor:
@@ -64,10 +66,12 @@ def on_disk(image: Tensor) -> Tensor:
     """
     plain = np.ascontiguousarray(image.detach().cpu().numpy())
     size = -(-plain.nbytes // mmap.PAGESIZE) * mmap.PAGESIZE
-    file = next((file for file in _files if file.size == size and file.free), None)
-    if file is None:
-        _files.add(file := _File(size))
-    return file.put(plain)
+    with _TAKING:
+        file = next((file for file in _files if file.size == size and file.free), None)
+        if file is None:
+            _files.add(file := _File(size))
+        slot = file.free.pop()
+    return file.put(plain, slot)
 
 
 def rest(view: TrainingView, log: Stats) -> bool:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import gc
 import mmap
 import sys
+import threading
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,7 @@ from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView, training_vi
 from mvsgs_core.mapping.resting_images import SLOTS, on_disk, rest
 from mvsgs_core.stats import Stats
 from tests.support.full_disk import full_after
+from tests.support.patience import LONG
 
 MAPS, FILES = Path("/proc/self/maps"), Path("/proc/self/fd")
 
@@ -31,6 +34,28 @@ def view_of(value: int) -> TrainingView:
         mask=np.arange(80).reshape(shape) != value,
     )  # fmt: skip
     return training_view(given, np.eye(4), None, torch.device("cpu"))
+
+
+def test_two_threads_do_not_take_the_same_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As two maps in one program might: the second comes when the first has seen that there is room."""
+    monkeypatch.setattr(resting_images, "SLOTS", 2)
+    monkeypatch.setattr(resting_images, "_files", weakref.WeakSet())
+    found = {7: on_disk(image(7))}  # of a file with room for one more
+    second = threading.Thread(target=lambda: found.update({8: on_disk(image(8))}))
+
+    class Interrupted(list[int]):
+        def __len__(self) -> int:
+            count = super().__len__()
+            if second.ident is None:
+                second.start()
+                second.join(0.2)
+            return count
+
+    (file,) = resting_images._files
+    file.free = Interrupted(file.free)
+    found[9] = on_disk(image(9))
+    second.join(LONG)
+    assert {k for k, kept in found.items() if torch.equal(kept, image(k))} == {7, 8, 9}
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="mappings are counted as Linux tells them")
@@ -83,7 +108,7 @@ def test_where_disk_or_system_take_no_more_an_image_stays_in_memory(monkeypatch:
 
     with monkeypatch.context() as patch:
         patch.setattr(resting_images, "_files", set())
-        patch.setattr(resting_images.mmap, "mmap", no_more)
+        patch.setattr(mmap, "mmap", no_more)
         assert not rest(other, log)
     assert not one.image_on_disk
     assert not other.image_on_disk
