@@ -103,6 +103,7 @@ class FrontEnd:
         moves = sample_field(field, self.propagated)
         if self.step is not None and self._rests(self.step.matches.alive, moves, image):
             return replace(self.step, still=True, localization=self.step.localization if with_pose else None)
+        velocity = self.last.velocity
         self._set_velocity(image, field)
         guess = self.propagated + moves
         matches, fraction = self.matcher.match(self.reference, image, guess, self.config.feature_fraction)
@@ -117,7 +118,8 @@ class FrontEnd:
             guess, _ = self.graph.predict_pose(self.reference.index, found.cam_from_world)
         step = Step(self.reference.index, matches, fraction, flow, False, found)
         if self.is_lost(step):
-            image.velocity = None
+            image.velocity, self.last.velocity = None, velocity
+            self.last.__dict__.pop("cell_velocity", None)
         else:
             self.propagated = np.where(alive[:, None], matches.target, np.nan_to_num(guess, nan=-1e3))
             self.last = image

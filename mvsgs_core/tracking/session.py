@@ -135,8 +135,8 @@ class Session:
         with self.stats.time("front end"):
             step = self.front_end.follow(frame, with_pose=not initializing)
         followed = not self.front_end.is_lost(step)
-        if initializing:
-            self.diagnosis.saw(self._missed or self.front_end.reference, frame, step, not followed)
+        if initializing and (followed or self._at_work):
+            self.diagnosis.saw(self.front_end.reference, frame, step, not followed)
         if followed:
             self._missed = None
         if step.still:
@@ -146,7 +146,7 @@ class Session:
         if self._at_work:
             return self._follow_beside_work(frame, step if followed else None, record)
         if initializing:
-            return self._initialize(frame, step, record) if followed else self._initialize_anew(frame, record)
+            return (self._initialize if followed else self._initialize_anew)(frame, step, record)
         return self._track(frame, step, record) if followed else self._lose(frame, record)
 
     def _stand_still(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update:
@@ -231,22 +231,27 @@ class Session:
         place = self.relocalizer.relocalize(frame) if self.segment > 0 else None
         return Update(record.state) if place is None else self._resume(frame, record, place)
 
-    def _initialize_anew(self, frame: TrackingImage, record: FrameRecord) -> Update:
+    def _initialize_anew(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update:
         """The keyframes that wait can't be followed: they go where the next frame only can be from this one.
 
         Else this one was bad: a hand before the lens, a jerk. The camera may be in an earlier segment, too.
         """
+        before = self._missed
+        follows = before is not None and self.front_end.follows(before, frame)
+        if not follows and self.front_end.reference is not None:
+            self.diagnosis.saw(before or self.front_end.reference, frame, step, True)
         if not self._has_texture(frame):
             return Update(record.state)
-        place = self._search_map(frame)
-        if place is not None:
+        if (place := self._search_map(frame)) is not None:
             return self._resume(frame, record, place)
-        before, self._missed = self._missed, frame
-        if before is None or not self.front_end.follows(before, frame):
+        self._missed = frame
+        if before is None or not follows:
             return Update(record.state)
         self.initializer.abandon()
         self._begin_segment(before, record_of(self.records, before.index))
-        return self._initialize(frame, self.front_end.follow(frame, with_pose=False), record)
+        step = self.front_end.follow(frame, with_pose=False)
+        self.diagnosis.saw(before, frame, step, False)
+        return self._initialize(frame, step, record)
 
     def _begin_tracking(self, keyframes: list[int], record: FrameRecord) -> Steps[Update]:
         """The first keyframes of a segment are solved; frames before and between them are matched at once."""
@@ -284,13 +289,11 @@ class Session:
 
     def _track(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update:
         """A frame whose pose is known; perhaps a keyframe."""
-        self.phase = Phase.TRACKING
-        record.state = TrackingState.TRACKED
+        self.phase, record.state = Phase.TRACKING, TrackingState.TRACKED
         record.follow(self.graph, step.reference, step.matches, step.pose, frame)
-        side = frame.longer_side
         limit = self.covisible_keyframes.limit(step.reference, self.choice.max_flow)
-        wanted = self.choice.wants(frame.index, step, side, limit)
-        if self.choice.moved(step, side, limit) and self._reuse_keyframe(frame, step):
+        wanted = self.choice.wants(frame.index, step, frame.longer_side, limit)
+        if self.choice.moved(step, frame.longer_side, limit) and self._reuse_keyframe(frame, step):
             return Update(record.state)
         if not wanted:
             self._tail.add(frame, step)
@@ -339,8 +342,7 @@ class Session:
     def _relocalize(self, frame: TrackingImage, record: FrameRecord) -> Update:
         """The map is searched for the camera; when patience is over, a new segment begins."""
         self.phase = Phase.RELOCALIZING
-        place = self._search_map(frame)
-        if place is not None:
+        if (place := self._search_map(frame)) is not None:
             return self._resume(frame, record, place)
         if not self.relocalizer.hopeless:
             return Update(record.state)
@@ -356,8 +358,7 @@ class Session:
     def _resume(self, frame: TrackingImage, record: FrameRecord, place: PlaceMatch) -> Update:
         """Tracking goes on from a keyframe that was found in a frame; a segment that has no map yet is given up."""
         self.initializer.abandon()
-        self.phase = Phase.TRACKING
-        self.segment = self.graph.keyframes[place.index].segment
+        self.phase, self.segment = Phase.TRACKING, self.graph.keyframes[place.index].segment
         self._follow_place(frame, place)
         self.relocalizer.found()
         self.stats.count("relocalized")

@@ -115,7 +115,8 @@ class Calibration:
             self._say_zoomed(zoom)
             return
         if not self.guessed:
-            self._check_given(members[:FEW])
+            own = [index for index in members if index >= 0]  # of a map that is gone on with, others come first
+            self._check_given((own if len(own) >= self.config.min_keyframes else members)[:FEW])
             return
         who = f"the first {MANY} keyframes" if len(members) > MANY else "all keyframes together"
         members = members[:MANY]

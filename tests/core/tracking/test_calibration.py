@@ -45,6 +45,18 @@ def test_a_contradiction_is_told_of_the_focal_length_that_was_used(
     assert stats.values["focal_checked_px"] == pytest.approx(325.0 if of_map else 390.0)
 
 
+@pytest.mark.parametrize("own", [20, 3])
+def test_on_a_large_map_the_stream_s_own_keyframes_are_asked(own: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The map's agree with the focal length that they were made with; of a few keyframes nothing can be told."""
+    asked: list[list[int]] = []
+    monkeypatch.setattr(calibration, "find_zoom", lambda *_: None)
+    monkeypatch.setattr(calibration, "focal_of_all", lambda graph, members, threads: asked.append(members))
+    graph = KeyframeGraph(np.array([150.0, 150.0, 160.0, 120.0]))
+    checked = Calibration(graph, FocalConfig(), Stats(), 300.0, (480, 640), False, 0.0, False, 1)
+    checked.check([*range(-200, 0), *range(own)])
+    assert (asked[0][0] == 0) == (own == 20)
+
+
 @pytest.mark.parametrize(
     ("parts", "spread", "said"), [(3, 0.01, True), (3, 0.02, False), (2, 0.01, False), (0, 0.0, False)]
 )

@@ -51,6 +51,17 @@ def test_the_reason_is_what_was_measured(items: object, kind: str, figures: str)
 
 
 @pytest.mark.slow
+def test_a_jump_is_one_frame_that_could_not_be_followed() -> None:
+    """The next one is followed from it, and the start begins there."""
+    places = [true_room(k) for k in (0, 75, 150, 225)]
+    items = [replace(place, index=n, timestamp=n / 20.0) for n, place in enumerate(p for p in places for _ in range(4))]
+    tracker, _, _ = track(items)
+    diagnosis = tracker.session.diagnosis
+    assert diagnosis.lost.frames == len(places) - 1
+    assert diagnosis.jumped.frames == 0
+
+
+@pytest.mark.slow
 def test_a_map_has_no_reason_to_be_none() -> None:
     tracker, _, _ = track(synthetic(frames=80)[:30])
     assert tracker.nothing == ""

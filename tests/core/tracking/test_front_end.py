@@ -99,6 +99,19 @@ def test_a_lost_frame_leaves_things_as_they_were() -> None:
     assert not made.is_lost(made.follow(image(4), with_pose=True)), "it goes on from the last frame that was followed"
 
 
+def test_a_lost_frame_leaves_the_first_keyframe_without_a_velocity_until_one_is_followed() -> None:
+    """It is what the rolling shutter of that keyframe is corrected by."""
+    made, noise = front_end(0), np.random.default_rng(0).integers(0, 256, (240, 320, 3), np.uint8)
+    assert made.reference is not None
+    bad = TrackingImage.of(2, 0.1, noise, made.reference.size, False)
+    assert made.is_lost(made.follow(bad, with_pose=False))
+    assert made.reference.velocity is None
+    followed = at(4, 0.2)
+    assert not made.is_lost(made.follow(followed, with_pose=False))
+    assert made.reference.velocity is followed.velocity
+    assert followed.velocity is not None
+
+
 def test_a_frame_is_lost_by_too_few_points_or_a_pose_that_they_do_not_agree_on() -> None:
     made = front_end(0)
     step = made.follow(image(2), with_pose=True)
