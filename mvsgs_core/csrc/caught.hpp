@@ -4,7 +4,7 @@
 #include <exception>
 #include <utility>
 
-// Keeps the first that is thrown inside, for behind the region: what Python gets then is a MemoryError.
+// Keeps the first that is thrown inside, for behind the region: Python gets a MemoryError, or what else it was.
 class Caught {
    public:
     template <class Work>
@@ -16,6 +16,7 @@ class Caught {
             if (!first_) first_ = std::current_exception();
         }
     }
+    bool any() const { return bool(first_); }  // not while others may throw
     void rethrow() const {
         if (first_) std::rethrow_exception(first_);
     }

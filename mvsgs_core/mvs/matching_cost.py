@@ -18,14 +18,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CostConfig:
-    """The cost of a hypothesis: that of each neighbor in adaptive windows, the mean over the best neighbors."""
+    """The cost of a hypothesis: that of each neighbor in adaptive windows, the mean over the best neighbors.
+
+    Raises ValueError for a noise out of its range: without any, flat windows have no correlation.
+    """
 
     name: Literal["zncc"] = "zncc"  # zncc: 1 - ZNCC, and a part for the difference of gray level
     top_k: int = 3  # of the neighbors, per pixel and hypothesis: the others may be occluded
-    noise: float = 1.5  # gray levels²: added to both windows' variances
+    noise: float = 1.5  # gray levels², from 1e-6 to 1e6: added to both windows' variances
     contrast: float = 8.0  # gray levels: what differs so from a window's center counts 1 / e in it
     intensity_weight: float = 0.0  # of the difference of both windows' means, which ZNCC doesn't see, in the cost
     intensity_range: float = 20.0  # gray levels: that difference costs 1 from here on
+
+    def __post_init__(self) -> None:
+        if not 1e-6 <= self.noise <= 1e6:
+            raise ValueError(f"cost.noise={self.noise}: gray levels², from 1e-6 to 1e6")
 
 
 class MatchingCost(ABC):

@@ -17,7 +17,7 @@ from mvsgs_core.rasterizer.splats import FIELDS
 
 
 def forward(settings: RenderSettings, parameters: list[Tensor]) -> tuple[Images, Rendered]:
-    """See `BackEnd`. Raises ValueError unless the splats are float32 in main memory."""
+    """See `BackEnd`. Raises ValueError unless the splats are float32 in main memory, and for too many pairs."""
     means = parameters[0]
     if means.dtype != torch.float32 or means.device.type != "cpu":
         raise ValueError(

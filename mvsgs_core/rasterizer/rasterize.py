@@ -88,7 +88,8 @@ def rasterize(
     "ges_scale".
     backend: "auto" takes "triton" on a GPU and "cpu" otherwise.
 
-    Raises ValueError for shapes, dtypes, sizes or names that do not fit, ImportError if the back end is not there.
+    Raises ValueError for shapes, dtypes, sizes or names that do not fit and for a view of 2^31 pairs of splats and
+    tiles or more, MemoryError if there is too little for the "cpu" back end, ImportError if the back end is not there.
     """
     splats.check()
     kernels.check_kernel(kernel)

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvsgs_core import geometry
-from mvsgs_core.rasterizer.rasterize import Render, rasterize
+from mvsgs_core import geometry, native
+from mvsgs_core.rasterizer.rasterize import Render, RenderSettings, rasterize
 from mvsgs_core.rasterizer.splats import Splats
 
 POSE = geometry.se3_exp(np.array([0.1, -0.05, 0.2, 0.05, -0.1, 0.03]))
@@ -28,6 +28,38 @@ def random_splats(count: int, bases: int = 4, seed: int = 0, log_scale: float = 
         sh=torch.randn(count, bases, 3, generator=g) * 0.3,
         betas=torch.rand(count, generator=g) * 2.5 + 0.8,
     )
+
+
+def wide_splats(count: int) -> Splats:
+    """Each on every tile of any image."""
+    ones = torch.ones(count)
+    means, quaternions = torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+    return Splats(
+        means.repeat(count, 1), torch.full((count, 3), 3.0), quaternions.repeat(count, 1), ones,
+        torch.ones(count, 1, 3), 2 * ones,
+    )  # fmt: skip
+
+
+def render_settings(
+    world_from_cam: np.ndarray, camera: np.ndarray, size: tuple[int, int], kernel: str
+) -> RenderSettings:
+    return RenderSettings(
+        pose=torch.from_numpy(world_from_cam), intrinsics=tuple(camera.tolist()), size=size, readout=(0.0,) * 6,
+        exact=kernel == "exact", background=(0.0, 0.0, 0.0), near=1e-3, antialiased=False, degree=0, weights=False,
+        threads=2,
+    )  # fmt: skip
+
+
+def kernel_pass(
+    splats: Splats, world_from_cam: np.ndarray, camera: np.ndarray, size: tuple[int, int], kernel: str = "gaussian",
+    **options: Any,
+) -> Any:  # fmt: skip
+    """What the C++ kernel keeps of a forward pass."""
+    settings = render_settings(world_from_cam, camera, size, kernel)
+    return native.load("rasterizer").forward(
+        settings, settings.pose, list(splats.tensors().values()), color=torch.empty(*size, 3), depth=torch.empty(size),
+        opacity=torch.empty(size), radii=torch.empty(len(splats)), **options,
+    )  # fmt: skip
 
 
 def copy(splats: Splats, dtype: torch.dtype = torch.float32, device: str = "cpu") -> Splats:

@@ -7,6 +7,8 @@
 #include <cmath>
 #include <limits>
 
+#include "caught.hpp"
+
 namespace partition {
 namespace {
 
@@ -237,12 +239,14 @@ private:
 
 std::vector<int64_t> split(const Image& image, double angle, float price, int threads, int64_t* labels) {
     Splitting splitting(image, angle, price);
+    Caught caught;
 #pragma omp parallel num_threads(threads)
     {
         std::array<Sums, kKeys> sums;
 #pragma omp for schedule(dynamic)
-        for (int64_t top = 0; top < image.height; top += kSide) splitting.choose(top, sums);
+        for (int64_t top = 0; top < image.height; top += kSide) caught([&] { splitting.choose(top, sums); });
     }
+    caught.rethrow();
     return splitting.follow(labels);
 }
 

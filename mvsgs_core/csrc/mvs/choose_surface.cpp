@@ -7,6 +7,7 @@
 #include <cstring>
 #include <vector>
 
+#include "caught.hpp"
 #include "mvs/lanes.hpp"
 #include "mvs/mvs.hpp"
 
@@ -134,14 +135,17 @@ void choose_surface(const float* cost, const float* surfaces, int count, int hei
 
     // Each sum is filled by one thread in a fixed order: the result does not depend on timing.
     std::vector<float> down(volume, 0.0f), up(volume, 0.0f), right(volume, 0.0f), left(volume, 0.0f);
-#pragma omp parallel for schedule(dynamic, 1) num_threads(o.threads)
-    for (int job = 0; job < 4; ++job) {
+    const auto add_paths = [&](int job) {
         if (job < 2) {
             for (int dx : {0, 1, -1}) add_path(upright, dx, job == 1, o, job == 0 ? down.data() : up.data());
         } else {
             add_path(sideways, 0, job == 3, o, job == 2 ? right.data() : left.data());
         }
-    }
+    };
+    Caught caught;
+#pragma omp parallel for schedule(dynamic, 1) num_threads(o.threads)
+    for (int job = 0; job < 4; ++job) caught([&] { add_paths(job); });
+    caught.rethrow();
     const float share = 1.0f / 8.0f;
     std::vector<float> horizontal(pixels);
     for (int k = 0; k < count; ++k) {

@@ -1,5 +1,6 @@
 // A plane or surface sweep: warp, match in adaptive windows, mean over the best views.
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
@@ -10,6 +11,7 @@
 
 #include <omp.h>
 
+#include "caught.hpp"
 #include "mvs/matching_cost.hpp"
 #include "mvs/mvs.hpp"
 #include "mvs/windows.hpp"
@@ -142,8 +144,10 @@ void sweep(const Images& images, const Hypotheses& h, int count, const std::uint
     const MakeCost make = find_cost(o.name);
     std::vector<std::unique_ptr<MatchingCost>> matching;  // here: what options without sense raise cannot leave a thread
     for (int i = 0; i < o.threads; ++i) matching.push_back(make(o, padded));
+    std::atomic<int> next{0};  // band; a thread without memory leaves them to the others
+    Caught caught;
 #pragma omp parallel num_threads(o.threads)
-    {
+    caught([&] {
         MatchingCost& match = *matching[omp_get_thread_num()];
         Windows windows(width, o.radius);
         NeighborRows there(padded, o.radius);
@@ -152,8 +156,7 @@ void sweep(const Images& images, const Hypotheses& h, int count, const std::uint
             return lowest.data() + static_cast<std::size_t>(band_row) * padded * best;
         };
         std::vector<Columns> runs;
-#pragma omp for schedule(dynamic)
-        for (int band = 0; band < bands; ++band) {
+        for (int band = next++; band < bands; band = next++) {
             const int y0 = band * kBand, y1 = std::min(y0 + kBand, height);
             windows.prepare(images.reference, height, y0, y1, o.contrast, o.noise);
             for (int k = 0; k < count; ++k) {
@@ -184,7 +187,8 @@ void sweep(const Images& images, const Hypotheses& h, int count, const std::uint
                 }
             }
         }
-    }
+    });
+    caught.rethrow();
 }
 
 }  // namespace
@@ -205,13 +209,14 @@ void view_correlation(const Images& images, const float* inverse_depth, const Co
     const int height = images.height, width = images.width;
     const std::vector<float> step(static_cast<std::size_t>(height) * width, 0.0f);
     const int bands = (height + kBand - 1) / kBand, padded = padded_width(width);
+    std::atomic<int> next{0};
+    Caught caught;
 #pragma omp parallel num_threads(o.threads)
-    {
+    caught([&] {
         Windows windows(width, o.radius);
         NeighborRows there(padded, o.radius);
         Correlation found(padded);
-#pragma omp for schedule(dynamic)
-        for (int band = 0; band < bands; ++band) {
+        for (int band = next++; band < bands; band = next++) {
             const int y0 = band * kBand, y1 = std::min(y0 + kBand, height);
             windows.prepare(images.reference, height, y0, y1, o.contrast, o.noise);
             for (int n = 0; n < images.views; ++n) {
@@ -224,7 +229,8 @@ void view_correlation(const Images& images, const float* inverse_depth, const Co
                 }
             }
         }
-    }
+    });
+    caught.rethrow();
 }
 
 }  // namespace mvs

@@ -28,6 +28,7 @@ void require_tiles(const std::optional<Tiles>& needed, std::size_t h, std::size_
 
 void check(const mvs::CostOptions& o) {
     require(o.radius >= 0 && o.radius <= 16 && o.top_k >= 1 && o.contrast > 0, "bad radius, top_k or contrast");
+    require(o.noise >= 1e-6f && o.noise <= 1e6f, "noise must lie in [1e-6, 1e6]");  // of less, the square may be 0
 }
 
 Result<float> cost_volume(Image reference, Stack neighbors, Warps warps, Image first, Image step, int hypotheses,

@@ -8,6 +8,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "caught.hpp"
 #include "mvs/exponential.hpp"
 #include "mvs/lanes.hpp"
 #include "mvs/mvs.hpp"
@@ -147,8 +148,7 @@ void semi_global(const float* cost, int height, int d, int width, const float* i
 
     // Two accumulators per orientation, each filled by one thread in a fixed order: the sum does not depend on timing.
     std::vector<float> down(volume, 0.0f), up(volume, 0.0f), right(volume, 0.0f), left(volume, 0.0f);
-#pragma omp parallel for schedule(dynamic, 1) num_threads(o.threads)
-    for (int job = 0; job < 4; ++job) {
+    const auto add_paths = [&](int job) {
         if (job == 0 || job == 1) {
             float* sum = job == 0 ? down.data() : up.data();
             add_path(upright, 0, job == 1, o, sum);
@@ -159,7 +159,11 @@ void semi_global(const float* cost, int height, int d, int width, const float* i
         } else {
             add_path(sideways, 0, job == 3, o, job == 2 ? right.data() : left.data());
         }
-    }
+    };
+    Caught caught;
+#pragma omp parallel for schedule(dynamic, 1) num_threads(o.threads)
+    for (int job = 0; job < 4; ++job) caught([&] { add_paths(job); });
+    caught.rethrow();
     std::vector<float>& horizontal_t = right;
     for (std::size_t i = 0; i < volume; ++i) horizontal_t[i] += left[i];
     std::vector<float>& horizontal = left;
@@ -170,8 +174,11 @@ void semi_global(const float* cost, int height, int d, int width, const float* i
         const std::size_t row = static_cast<std::size_t>(y) * d * width, out = static_cast<std::size_t>(y) * width;
         float* total = down.data() + row;
         for (int i = 0; i < d * width; ++i) total[i] = (total[i] + up[row + i] + horizontal[row + i]) * share;
-        select_row(total, d, width, o.temperature, index + out, probability + out, margin + out, best + out);
+        caught([&] {
+            select_row(total, d, width, o.temperature, index + out, probability + out, margin + out, best + out);
+        });
     }
+    caught.rethrow();
 }
 
 }  // namespace mvs

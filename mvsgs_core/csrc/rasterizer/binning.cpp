@@ -3,7 +3,10 @@
 // threads.
 #include <omp.h>
 
+#include <atomic>
 #include <cstring>
+#include <stdexcept>
+#include <string>
 
 #include "caught.hpp"
 #include "rasterizer/shading.hpp"
@@ -13,6 +16,22 @@ namespace splats {
 namespace {
 
 constexpr size_t kAhead = 12;  // splats fetched early: the depth order jumps through memory
+
+// Counts the pairs of all chunks: what takes them together then finds that there are few enough.
+class PairBudget {
+   public:
+    explicit PairBudget(uint32_t max_pairs) : max_pairs_(max_pairs) {}
+    void take(uint32_t pairs) {
+        if (taken_.fetch_add(pairs, std::memory_order_relaxed) + pairs >= max_pairs_)
+            throw std::invalid_argument("a view has " + std::to_string(max_pairs_) +
+                                        " pairs of splats and tiles or more: take fewer or smaller splats, or a "
+                                        "smaller image");
+    }
+
+   private:
+    const uint64_t max_pairs_;
+    std::atomic<uint64_t> taken_{0};
+};
 
 // Splats on the image and their footprints; depth is 0 where nothing is seen.
 SPLATS_INLINE void place(const Camera& camera, const Parameters& p, int64_t first, int count, ProjectedSplat* out,
@@ -179,17 +198,22 @@ void distribute(Frame& frame, size_t seen, int parts) {
 
 }  // namespace
 
-void bin(Frame& frame, const Parameters& parameters, float* radii, int threads) {
+void bin(Frame& frame, const Parameters& parameters, uint32_t max_pairs, float* radii, int threads) {
     const size_t count = size_t(parameters.count), chunks = (count + kChunk - 1) / kChunk;
     frame.splats.resize(count);
     frame.spans.resize(count);
     frame.depth_keys.resize(count);
     if (frame.chunk_pairs.size() < chunks) frame.chunk_pairs.resize(chunks);
     int64_t refused = 0;
+    PairBudget budget(max_pairs);
     Caught caught;  // pairs take what memory the view asks for
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1) reduction(+ : refused)
     for (size_t chunk = 0; chunk < chunks; ++chunk)
-        caught([&] { fill_chunk(frame, parameters, chunk, radii, refused); });
+        caught([&] {
+            budget.take(0);  // no more memory for a view that has too many
+            fill_chunk(frame, parameters, chunk, radii, refused);
+            budget.take(frame.chunk_pairs[chunk].count);
+        });
     caught.rethrow();
     frame.refused = refused;
     join_chunks(frame, count, chunks, threads);

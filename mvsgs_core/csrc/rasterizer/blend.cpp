@@ -2,6 +2,7 @@
 // splats whose ellipse touches it pass by, a group of them at a time, until the block is full.
 #include <omp.h>
 
+#include "caught.hpp"
 #include "rasterizer/pixels.hpp"
 #include "rasterizer/tile.hpp"
 
@@ -21,9 +22,10 @@ struct Workspace {
     void take(const Frame& frame, const Tile& tile, bool weights) {
         const uint32_t count = tile.end - tile.begin, last = uint32_t(frame.pair_count) - 1;
         if (placed.size() < count + 1) {
-            placed.resize(count + count / 2 + 64);
-            blocks.resize(placed.size() + kLanes);
-            list.resize(placed.size() + kLanes);
+            const size_t room = size_t(count) + count / 2 + 64;
+            blocks.resize(room + kLanes);
+            list.resize(room + kLanes);
+            placed.resize(room);  // last: it tells what there is room for
         }
         for (uint32_t i = 0; i < count; ++i) {
             __builtin_prefetch(&frame.splats[frame.pairs[std::min(tile.begin + i + kAhead, last)].splat]);
@@ -96,8 +98,9 @@ SPLATS_INLINE void fetch(const Frame& frame, const Tile& tile, const Images<floa
     }
 }
 
+// Never inlined: its registers are then its own.
 template <bool Exact, bool Weights>
-void blend_tile(Frame& frame, const Tile& tile, const Images<float>& images, Workspace& work) {
+[[gnu::noinline]] void blend_tile(Frame& frame, const Tile& tile, const Images<float>& images, Workspace& work) {
     work.take(frame, tile, Weights);
     fetch(frame, tile, images);
     for (int block = 0; block < kBlocks; ++block) {
@@ -119,15 +122,17 @@ template <bool Exact, bool Weights>
 void blend_all(Frame& frame, const Images<float>& images, int threads) {
     const int tiles = frame.tiles_x * frame.tiles_y;
     int64_t evaluated = 0, contributed = 0;
+    Caught caught;
 #pragma omp parallel num_threads(threads) reduction(+ : evaluated, contributed)
     {
         Workspace work;
 #pragma omp for schedule(dynamic, 4)
         for (int index = 0; index < tiles; ++index)
-            blend_tile<Exact, Weights>(frame, Tile(frame, index), images, work);
+            caught([&] { blend_tile<Exact, Weights>(frame, Tile(frame, index), images, work); });
         evaluated += work.evaluated;
         contributed += work.contributed;
     }
+    caught.rethrow();
     frame.evaluated = evaluated;
     frame.contributed = contributed;
 }

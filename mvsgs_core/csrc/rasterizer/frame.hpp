@@ -19,6 +19,7 @@
 
 namespace splats {
 
+constexpr uint32_t kMaxPairs = uint32_t(1) << 31;  // of a view, with tiles: places are 32-bit integers
 constexpr size_t kChunk = 1024;        // splats that a thread takes at once; sums by chunk do not depend on the threads
 constexpr int kTile = 16;              // pixels; 16 blocks of 4x4, one vector each
 constexpr float kBlur = 0.3f;          // px^2 on the diagonal of the image covariance
@@ -167,7 +168,8 @@ struct Stepped {
 };
 
 // Projects and orders the splats and pairs them with the tiles they touch; radii (N), px, are 0 where nothing is seen.
-void bin(Frame& frame, const Parameters& parameters, float* radii, int threads);
+// Raises std::invalid_argument for max_pairs pairs or more.
+void bin(Frame& frame, const Parameters& parameters, uint32_t max_pairs, float* radii, int threads);
 
 // Blends all tiles; color (H, W, 3), depth (H, W), opacity (H, W). weights: fill frame.weight_slots as well.
 void blend(Frame& frame, bool weights, float* color, float* depth, float* opacity, int threads);

@@ -46,7 +46,7 @@ struct Pass {
 };
 
 std::unique_ptr<Pass> forward(nb::handle settings, Array<const double> pose, const SplatArrays& splats, Out color,
-                              Out depth, Out opacity, Out radii) {
+                              Out depth, Out opacity, Out radii, uint32_t max_pairs) {
     auto pass = std::make_unique<Pass>();
     Frame& frame = *pass->frame;
     frame.camera = camera_of(settings, pose);
@@ -62,7 +62,7 @@ std::unique_ptr<Pass> forward(nb::handle settings, Array<const double> pose, con
     const Parameters p = parameters(frame, splats);
     {
         const nb::gil_scoped_release released;
-        bin(frame, p, radii.data(), pass->threads);
+        bin(frame, p, max_pairs, radii.data(), pass->threads);
         blend(frame, weights, color.data(), depth.data(), opacity.data(), pass->threads);
     }
     return pass;
@@ -109,6 +109,9 @@ std::tuple<int64_t, int64_t> backward_step(Pass& pass, const std::array<Out, 6>&
     const auto& [means, log_scales, quaternions, opacity_logits, sh, betas] = values;
     const Parameters p{means.data(), log_scales.data(), quaternions.data(), opacity_logits.data(), sh.data(), betas.data(),
                        int64_t(means.shape(0)), int(sh.shape(1)), frame.degree, frame.exact, frame.antialiased};
+    const size_t count = size_t(p.count);
+    if (ages.size() != count || means2d_gradient.size() != count || means2d_views.size() != count)
+        throw std::invalid_argument("backward_step: ages or counters differ in length from the splats");
     const int widths[6] = {3, 3, 4, 1, 3 * p.bases, 1};
     std::vector<adam::Group> groups;
     std::vector<int> fields;
@@ -179,7 +182,7 @@ SPLATS_MODULE(MVSGS_MODULE) {
         .def_prop_ro("evaluated", [](const Pass& pass) { return pass.frame->evaluated; })
         .def_prop_ro("contributed", [](const Pass& pass) { return pass.frame->contributed; });
     m.def("forward", &forward, nb::arg("settings"), nb::arg("pose"), nb::arg("splats"), nb::arg("color"),
-          nb::arg("depth"), nb::arg("opacity"), nb::arg("radii"));
+          nb::arg("depth"), nb::arg("opacity"), nb::arg("radii"), nb::arg("max_pairs") = kMaxPairs);
     m.def("backward", &backward, nb::arg(), nb::arg("splats"), nb::arg("color"), nb::arg("depth"), nb::arg("opacity"),
           nb::arg("on_color"), nb::arg("on_depth").none(), nb::arg("on_opacity").none(), nb::arg("on_splats"),
           nb::arg("on_means2d"), nb::arg("on_pose"));

@@ -3,7 +3,10 @@
 #include <omp.h>
 
 #include <cstring>
+#include <optional>
 
+#include "caught.hpp"
+#include "rasterizer/pose_sum.hpp"
 #include "rasterizer/shading.hpp"
 
 namespace splats {
@@ -211,24 +214,6 @@ SPLATS_INLINE void scatter(const Lanes& lanes, float* values, size_t stride, int
         for (int i = 0; i < count; ++i) values[i * stride] = lane[i];
 }
 
-// Sums of the pose's gradient, lane by lane in float64.
-struct PoseSum {
-    alignas(64) double lanes[12][kLanes] = {};
-
-    void add(int entry, const Lanes& part) {
-        alignas(64) float values[kLanes];
-        store(part, values);
-        for (int i = 0; i < kLanes; ++i) lanes[entry][i] += values[i];
-    }
-
-    void total(double* pose) const {
-        for (int k = 0; k < 12; ++k) {
-            pose[k] = 0.0;
-            for (const double value : lanes[k]) pose[k] += value;
-        }
-    }
-};
-
 // Clears every lane but those of `good`; for all that is finite or not seen, for what is not finite spreads otherwise.
 template <int Count>
 SPLATS_INLINE void keep(const Mask& good, Lanes (&values)[Count], int count = Count) {
@@ -240,9 +225,10 @@ SPLATS_INLINE void find_bad(const Lanes (&values)[Count], Ints& bad, int count =
 }
 
 // The gradients of up to sixteen splats to `out`, from its row `at` on; returns how many are refused, as they are not
-// finite. Never inlined: what it rounds is then the same wherever it is called.
+// finite: these are 0, and `taken`, where it is not null, becomes false. Never inlined: what it rounds is then the same
+// wherever it is called.
 [[gnu::noinline]] int64_t backward_of(const Frame& frame, const Parameters& p, size_t first, int count, size_t at,
-                                      Gradients& out, PoseSum& pose) {
+                                      Gradients& out, PoseSum& pose, bool* taken = nullptr) {
     const int used = 3 * (p.degree + 1) * (p.degree + 1);
     const size_t width = 3 * size_t(p.bases);
     float has_pairs[kLanes] = {};
@@ -267,6 +253,11 @@ SPLATS_INLINE void find_bad(const Lanes (&values)[Count], Ints& bad, int count =
         find_bad(g.sh, bad, used);
         const Mask good = seen & without_sign(bad);
         refused = splats::count(seen) - splats::count(good);
+        if (refused && taken) {
+            alignas(64) float refuses[kLanes];
+            store(where(seen, all(1.0f)) - where(good, all(1.0f)), refuses);
+            for (int i = 0; i < count; ++i) taken[i] &= refuses[i] < 0.5f;
+        }
         keep(good, g.mean);
         keep(good, g.log_scale);
         keep(good, g.quaternion);
@@ -293,23 +284,18 @@ SPLATS_INLINE void find_bad(const Lanes (&values)[Count], Ints& bad, int count =
     return refused;
 }
 
-// Adds up the chunks' parts, in their order.
-void sum_pose(const std::vector<double>& parts, double* pose) {
-    std::fill(pose, pose + 12, 0.0);
-    for (size_t k = 0; k < parts.size(); ++k) pose[k % 12] += parts[k];
-}
-
 // Gradients of a block of splats, where they stay in the cache until they are stepped.
 struct BlockGradients {
-    static constexpr size_t kCount = adam::kBlock;
     std::array<std::vector<float>, 7> rows;  // by field of Splats, and of the means on the image
     Gradients out;
+    std::vector<adam::Group> groups;  // of the step, with these gradients
 
-    explicit BlockGradients(int bases) {
+    BlockGradients(int bases, const std::vector<adam::Group>& stepped, const std::vector<int>& fields) : groups(stepped) {
         const size_t widths[7] = {3, 3, 4, 1, 3 * size_t(bases), 1, 2};
-        for (int k = 0; k < 7; ++k) rows[k].resize(widths[k] * kCount);
+        for (int k = 0; k < 7; ++k) rows[k].resize(widths[k] * adam::kBlock);
         out = {rows[0].data(), rows[1].data(), rows[2].data(), rows[3].data(),
                rows[4].data(), rows[5].data(), rows[6].data(), nullptr};
+        for (size_t k = 0; k < groups.size(); ++k) groups[k].gradient = rows[fields[k]].data();
     }
 };
 
@@ -353,39 +339,43 @@ void project_and_step(Frame& frame, const Parameters& p, const adam::Step& step,
     const size_t count = size_t(p.count), chunks = (count + kChunk - 1) / kChunk;
     std::vector<double> pose(12 * chunks);
     int64_t refused = 0, refused_steps = 0;
+    Caught caught;
 #pragma omp parallel num_threads(threads) reduction(+ : refused, refused_steps)
     {
-        BlockGradients gradients(p.bases);
-        std::vector<adam::Group> groups = step.groups;
-        for (size_t k = 0; k < groups.size(); ++k) groups[k].gradient = gradients.rows[fields[k]].data();
+        std::optional<BlockGradients> gradients;
+        caught([&] { gradients.emplace(p.bases, step.groups, fields); });
         adam::Block block;
-        bool seen[adam::kBlock];
+        bool seen[adam::kBlock], taken[adam::kBlock];
+#pragma omp barrier
+        const size_t stepped = caught.any() ? 0 : chunks;  // all splats or none
 #pragma omp for schedule(dynamic, 1)
-        for (size_t chunk = 0; chunk < chunks; ++chunk) {
+        for (size_t chunk = 0; chunk < stepped; ++chunk) {
             PoseSum sums;
             const size_t last = std::min(count, (chunk + 1) * kChunk);
             for (size_t begin = chunk * kChunk; begin < last; begin += adam::kBlock) {
                 const size_t end = std::min(last, begin + adam::kBlock);
                 bool any_seen = false;
                 for (size_t i = begin; i < end; ++i)
-                    any_seen |= seen[i - begin] = frame.splats[i].radius > 0.0f;
+                    any_seen |= taken[i - begin] = seen[i - begin] = frame.splats[i].radius > 0.0f;
                 if (!any_seen) continue;
                 for (size_t first = begin; first < end; first += kLanes)
                     refused += backward_of(frame, p, first, int(std::min(size_t(kLanes), end - first)), first - begin,
-                                           gradients.out, sums);
+                                           gradients->out, sums, taken + (first - begin));
                 for (size_t i = begin; i < end; ++i) {
                     if (!seen[i - begin]) continue;
-                    const double x = gradients.out.means2d[2 * (i - begin)], y = gradients.out.means2d[2 * (i - begin) + 1];
+                    const float* mean2d = gradients->out.means2d + 2 * (i - begin);
+                    const double x = mean2d[0], y = mean2d[1];
                     const float length = std::sqrt(float(double(float(x * x)) + y * y));  // rounded as PyTorch's norm
                     out.means2d_gradient[i] += finite(&length, 1) ? length : 0.0f;
                     out.means2d_views[i] += 1.0f;
                 }
                 block.origin = int64_t(begin);
-                refused_steps += step.of_block(block, groups, seen, int64_t(begin), int64_t(end));
+                refused_steps += step.of_block(block, gradients->groups, taken, int64_t(begin), int64_t(end));
             }
             sums.total(pose.data() + 12 * chunk);
         }
     }
+    caught.rethrow();
     sum_pose(pose, out.pose);
     out.refused = refused;
     out.refused_steps = refused_steps;

@@ -99,8 +99,10 @@ class TileWalk {
         blocks = blocks | (spread<3>(columns) >> shift & 15) << 12;
         const Ints tiles = window_ + (tile_row * tiles_x_ + tile);
         if (pairs_.count + kLanes > pairs_.tiles.size()) {
-            pairs_.blocks.resize(2 * pairs_.tiles.size() + 4096);  // first: tiles tell what there is room for
-            pairs_.tiles.resize(pairs_.blocks.size());
+            const size_t room = 2 * pairs_.tiles.size() + 4096;
+            if (room > UINT32_MAX) throw std::bad_alloc();  // more than a chunk's count can say
+            pairs_.blocks.resize(room);  // first: tiles tell what there is room for
+            pairs_.tiles.resize(room);
         }
         pairs_.count += append(blocks, tiles, pairs_.blocks.data() + pairs_.count, pairs_.tiles.data() + pairs_.count);
     }

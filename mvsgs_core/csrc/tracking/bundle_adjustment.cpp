@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "caught.hpp"
 #include "edge_kernel.hpp"
 #include "schur.hpp"
 
@@ -128,19 +129,24 @@ void BundleAdjuster::linearize(const State& state, NormalEquations& normal) cons
     normal.rhs.assign(n, 0.0);
     normal.sources.resize(problem_.keyframes);
     normal.cost = 0.0;
+    Caught caught;
     // "ordered": sums are taken in one order whatever the number of threads, so that results repeat.
 #pragma omp parallel for ordered schedule(static, 1) num_threads(problem_.threads) if (problem_.threads > 1)
     for (int k = 0; k < problem_.keyframes; ++k) {
         std::vector<double> local, rhs;
         double cost = 0.0;
+        bool linearized = false;
         SourceBlock& block = normal.sources[k];
         if (!out_[k].empty()) {
-            linearize_source(state, k, block, local, rhs, cost);
+            caught([&] {
+                linearize_source(state, k, block, local, rhs, cost);
+                linearized = true;
+            });
         } else {
             block = SourceBlock();
         }
 #pragma omp ordered
-        {
+        if (linearized) {
             normal.cost += cost;
             const int rows = static_cast<int>(rhs.size());
             auto global = [&](int r) {
@@ -156,6 +162,7 @@ void BundleAdjuster::linearize(const State& state, NormalEquations& normal) cons
             }
         }
     }
+    caught.rethrow();
     if (problem_.prior) {
         for (size_t c = 0; c < state.inverse_depth.size(); ++c) {
             const double d = state.inverse_depth[c] - problem_.prior[c];

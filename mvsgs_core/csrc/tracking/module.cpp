@@ -1,4 +1,4 @@
-// Python bindings of the tracking kernels. Array shapes are checked by the Python callers.
+// Python bindings of the tracking kernels. Lists of points are checked here, all other shapes by the Python callers.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -9,6 +9,7 @@
 #include <cmath>
 #include <cstdint>
 #include <optional>
+#include <stdexcept>
 
 #include "bundle_adjustment.hpp"
 #include "cholesky.hpp"
@@ -23,6 +24,15 @@ template <class T>
 using In = nb::ndarray<const T, nb::c_contig, nb::device::cpu>;
 template <class T>
 using Out = nb::ndarray<nb::numpy, T>;
+
+static void require(bool condition, const char* what) {
+    if (!condition) throw std::invalid_argument(what);
+}
+
+template <class T>
+static bool is_pairs(const In<T>& array) {
+    return array.ndim() == 2 && array.shape(1) == 2;
+}
 
 template <class T>
 static Out<T> to_numpy(std::vector<T>&& values, std::initializer_list<size_t> shape) {
@@ -110,6 +120,8 @@ static Pyramid pyramid(const std::vector<In<float>>& levels, int border) {
 static Out<float> lucas_kanade(const std::vector<In<float>>& a, const std::vector<In<float>>& b, In<float> points,
                                In<float> guess, int border, int start_level, int iterations, float window_sigma,
                                float min_eigenvalue, int threads) {
+    require(is_pairs(points) && is_pairs(guess) && guess.shape(0) == points.shape(0),
+            "lucas_kanade: points and guess must be (N, 2), of one length");
     const Pyramid pa = pyramid(a, border), pb = pyramid(b, border);
     const int levels = static_cast<int>(std::min(pa.levels.size(), pb.levels.size()));
     const TrackOptions options{std::min(start_level, levels - 1), iterations, window_sigma, min_eigenvalue};
@@ -138,6 +150,8 @@ static Out<float> lucas_kanade(const std::vector<In<float>>& a, const std::vecto
 
 static Out<double> median_of_nearest(In<double> points, In<double> values, In<double> queries, int count,
                                      double radius) {
+    require(is_pairs(points) && is_pairs(queries) && values.ndim() == 1 && values.shape(0) == points.shape(0),
+            "median_of_nearest: points must be (N, 2), values (N,) and queries (M, 2)");
     const int n = static_cast<int>(points.shape(0)), m = static_cast<int>(queries.shape(0));
     std::vector<double> out;
     {

@@ -2,12 +2,13 @@
 #pragma once
 
 #include <algorithm>
+#include <cmath>
 #include <limits>
 #include <vector>
 
 namespace mvsgs {
 
-// points (n, 2), values (n), queries (m, 2). NaN where no point lies within `radius`.
+// points (n, 2), values (n), queries (m, 2). NaN where no point lies within `radius`; what is NaN is no point or value.
 inline std::vector<double> nearest_medians(const double* points, const double* values, int n, const double* queries,
                                            int m, int count, double radius) {
     std::vector<double> out(m, std::numeric_limits<double>::quiet_NaN());
@@ -22,7 +23,7 @@ inline std::vector<double> nearest_medians(const double* points, const double* v
         best.clear();
         double limit = radius * radius;
         for (int k = 0; k < n; ++k) {
-            if (distance[k] > limit) continue;
+            if (!(distance[k] <= limit) || std::isnan(values[k])) continue;
             auto at = std::upper_bound(best.begin(), best.end(), std::make_pair(distance[k], values[k]));
             best.insert(at, {distance[k], values[k]});
             if (static_cast<int>(best.size()) > count) best.pop_back();

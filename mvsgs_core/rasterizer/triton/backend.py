@@ -76,7 +76,10 @@ def projected(parameters: list[Tensor], settings: RenderSettings) -> Pass:
     slots[order] = (ends - pairs[order]).int()
     total, left_out = torch.stack([pairs.sum(dtype=torch.int64), refused.sum()]).tolist()  # the host waits here
     if total >= MAX_PAIRS:
-        raise ValueError(f"{total} pairs of splats and tiles are too many for a view: fewer or smaller splats are")
+        raise ValueError(
+            f"a view has {MAX_PAIRS} pairs of splats and tiles or more: take fewer or smaller splats, or a "
+            "smaller image"
+        )
     pair_tiles = torch.full((total,), tiles, dtype=torch.int32, device=device)
     pair_splats = torch.zeros(total, dtype=torch.int32, device=device)
     if total:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -69,6 +70,26 @@ def test_a_part_of_the_cost_is_the_difference_of_gray_level() -> None:
     for backend in (NativeBackend(1), TorchBackend("cpu")):
         with pytest.raises(ValueError, match="intensity_weight"):
             swept(backend, p, 1, replace(COST, intensity_weight=1.5))
+
+
+@pytest.mark.parametrize("noise", [0.0, -1.0, 1e-20, np.inf, np.nan])
+def test_a_noise_under_which_flat_windows_have_no_correlation_is_refused(noise: float) -> None:
+    with pytest.raises(ValueError, match="noise"):
+        replace(COST, noise=noise)
+    given = SimpleNamespace(**{**vars(COST), "noise": noise})
+    p = problem()
+    with pytest.raises(ValueError, match="noise"):
+        swept(NativeBackend(1), p, 1, cast(CostConfig, given))
+    with pytest.raises(ValueError, match="noise"):
+        NativeBackend(1).view_correlation(p.images, p.first, 2, cast(CostConfig, given))
+
+
+def test_flat_windows_of_least_noise_have_a_cost() -> None:
+    flat = np.full(SIZE, 100.0, np.float32)
+    p = problem()
+    p = replace(p, images=replace(p.images, reference=flat, neighbors=np.stack([flat] * 3)))
+    for backend in (NativeBackend(1), TorchBackend("cpu")):
+        assert np.isfinite(swept(backend, p, 3, replace(COST, noise=1e-6))).all()
 
 
 def test_a_cost_of_no_hypothesis_is_refused() -> None:

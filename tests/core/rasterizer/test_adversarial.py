@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from mvsgs_core.mapping import optimizer
+from mvsgs_core.mapping.map_state import PARAMETERS, MapState
 from mvsgs_core.rasterizer.kernels import KERNELS
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
@@ -53,6 +56,42 @@ def test_gradients_that_are_not_finite_are_refused_and_counted(bad: float) -> No
     assert splats.means.grad is not None
     without = int((render.visible & (splats.means.grad == 0).all(dim=1)).sum())
     assert without >= render.backward.refused
+
+
+@pytest.mark.parametrize("kernel", ["gaussian", "exact"])
+def test_splats_whose_gradients_are_refused_stay_as_they_were(kernel: str) -> None:
+    """However their moments would move them; the others are stepped."""
+    state = MapState(4, torch.device("cpu"))
+    state.append(random_splats(60), torch.zeros(60, dtype=torch.int64))
+    for name in PARAMETERS:
+        state.first[name].fill_(0.1)
+        state.second[name].fill_(0.01)
+    camera: Any = (np.eye(4), intrinsics(SIZE), SIZE)
+    options: Any = {"kernel": kernel, "backend": "cpu"}
+    splats = copy(state.splats)
+    render = rasterize(splats, *camera, **options)
+    gradient = torch.ones_like(render.color)
+    gradient[divmod(int(render.opacity.detach().argmax()), SIZE[1])] = math.nan
+    render.color.backward(gradient)  # type: ignore[no-untyped-call]
+    assert splats.opacity_logits.grad is not None
+    refused = render.visible & (splats.opacity_logits.grad == 0)
+    assert int(refused.sum()) == render.backward.refused
+
+    before = {name: value.clone() for name, value in state.tensors().items()}
+    groups = optimizer.groups(optimizer.OptimizerConfig(), 1.0, 1.0, kernel == "exact", kernel)
+    step = optimizer.splat_step(state, groups, 100)
+    render = rasterize(state.splats, *camera, **options, step=step)
+    render.color.backward(gradient)  # type: ignore[no-untyped-call]
+    assert render.backward.refused == int(refused.sum())
+    assert step.refused == 0
+    stepped = render.visible & ~refused
+    assert 0 < int(refused.sum()) < int(render.visible.sum())
+    assert torch.equal(state.steps, stepped.to(torch.int32))
+    assert torch.equal(state.means2d_views, render.visible.to(torch.float32))
+    assert bool((state.splats.means != before["means"]).all(dim=1)[stepped].all())
+    for name, value in state.tensors().items():
+        if not name.startswith("means2d"):
+            assert torch.equal(value[~stepped], before[name][~stepped]), name
 
 
 EXTREMES = (

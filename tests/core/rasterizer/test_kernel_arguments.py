@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from mvsgs_core import native
 from mvsgs_core.mapping import optimizer
 from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.rasterizer.rasterize import rasterize
-from tests.support.rasterizer_scenes import random_splats
+from tests.support.rasterizer_scenes import kernel_pass, random_splats, wide_splats
+from tests.support.shared_data import ROOT
 
 ROWS, WIDTH = 5, 3
 
@@ -73,34 +75,62 @@ def test_splats_are_stepped_in_the_arrays_that_were_given_or_refused() -> None:
         step()
 
 
+def test_what_counts_the_steps_is_as_long_as_the_splats() -> None:
+    state = MapState(1, torch.device("cpu"))
+    state.append(random_splats(20, bases=1), torch.zeros(20, dtype=torch.int64))
+    groups = optimizer.groups(optimizer.OptimizerConfig(), 1.0, 1.0, False, "gaussian", widest_new=None)
+    camera = np.array([20.0, 20.0, 10.0, 8.0])
+    for name in ("ages", "means2d_gradient", "means2d_views"):
+        taken = optimizer.splat_step(state, groups, 100)
+        setattr(taken, name, getattr(taken, name)[:19].clone())
+        found = rasterize(state.splats, np.eye(4), camera, (16, 20), backend="cpu", step=taken)
+        with pytest.raises(ValueError, match="differ in length from the splats"):
+            found.color.sum().backward()
+    assert not state.steps.any()
+
+
+CAMERA, SIZE = np.array([900.0, 900.0, 960.0, 540.0]), (1080, 1920)
+TILES = 120 * 68
+
+
+def test_a_view_of_too_many_pairs_is_refused() -> None:
+    given: Any = (wide_splats(20), np.eye(4), CAMERA, SIZE)
+    for too_many in (1000, 20 * TILES):
+        with pytest.raises(ValueError, match=f"{too_many} pairs of splats and tiles or more: take fewer"):
+            kernel_pass(*given, max_pairs=too_many)
+    assert kernel_pass(*given, max_pairs=20 * TILES + 1).pairs == kernel_pass(*given).pairs == 20 * TILES
+
+
 SCRIPT = """
-import resource, numpy as np, torch
-from mvsgs_core.rasterizer.rasterize import rasterize
-from mvsgs_core.rasterizer.splats import Splats
+import resource, numpy as np
+from tests.support.rasterizer_scenes import kernel_pass, wide_splats
 
-def wide(count):  # each on every tile
-    ones = torch.ones(count)
-    return Splats(torch.tensor([[0.0, 0.0, 1.0]]).repeat(count, 1), 3 * torch.ones(count, 3),
-                  torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1), ones, torch.ones(count, 1, 3), 2 * ones)
-
-def render(count):
+def pairs(count, **options):
     camera = np.array([900.0, 900.0, 960.0, 540.0])
-    return rasterize(wide(count), np.eye(4), camera, (1080, 1920), backend="cpu", threads=2)
+    return kernel_pass(wide_splats(count), np.eye(4), camera, (1080, 1920), **options).pairs
 
-render(1)
-used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
-resource.setrlimit(resource.RLIMIT_AS, (used + 200_000_000, resource.RLIM_INFINITY))
+def bound(extra):
+    used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + extra, resource.RLIM_INFINITY))
+
+pairs(1)
+bound(200_000_000)
 try:
-    render(20_000)
+    pairs(20_000)
     print("no limit was met")
 except MemoryError:
     print("said")
-print(float(render(1).color.mean()) > 0)
+print(pairs(1))
+bound(400_000_000)
+try:
+    pairs(20_000, max_pairs=1_000_000)  # they would take 1 GB
+except ValueError:
+    print("refused before")
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="its memory is bounded as Linux bounds it")
 def test_a_view_that_takes_more_memory_than_there_is_ends_no_process() -> None:
-    found = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=120)
+    found = subprocess.run([sys.executable, "-c", SCRIPT], cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert found.returncode == 0, found.stderr
-    assert found.stdout.split("\n")[:2] == ["said", "True"]
+    assert found.stdout.split("\n")[:3] == ["said", str(TILES), "refused before"]

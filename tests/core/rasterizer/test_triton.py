@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from mvsgs_core import native
-from mvsgs_core.rasterizer.rasterize import Render, RenderSettings, rasterize
+from mvsgs_core.rasterizer.rasterize import Render, rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from tests.support.rasterizer_scenes import (
     POSE,
@@ -19,8 +18,10 @@ from tests.support.rasterizer_scenes import (
     extremes,
     gradients,
     intrinsics,
+    kernel_pass,
     random_splats,
     relative_error,
+    render_settings,
 )
 
 pytestmark = pytest.mark.slow
@@ -58,16 +59,9 @@ def pairs_of(splats: Splats, size: tuple[int, int], kernel: str) -> tuple[int, i
     """(pairs that the C++ kernel blends, pairs in the Triton lists of all tiles)."""
     from mvsgs_core.rasterizer.triton import backend as triton_backend
 
-    settings = RenderSettings(
-        pose=torch.from_numpy(POSE), intrinsics=tuple(intrinsics(size).tolist()), size=size, readout=(0.0,) * 6,
-        exact=kernel == "exact", background=(0.0, 0.0, 0.0), near=1e-3, antialiased=False, degree=0,
-        weights=False, threads=1,
-    )  # fmt: skip
+    settings = render_settings(POSE, intrinsics(size), size, kernel)
+    passed = kernel_pass(splats, POSE, intrinsics(size), size, kernel)
     parameters = list(splats.tensors().values())
-    passed = native.load("rasterizer").forward(
-        settings, settings.pose, parameters, color=torch.empty(*size, 3), depth=torch.empty(size),
-        opacity=torch.empty(size), radii=torch.empty(len(splats)),
-    )  # fmt: skip
     lists = triton_backend.projected([tensor.to(DEVICE) for tensor in parameters], settings).lists
     return passed.pairs, int(lists.tile_begin[-1])
 

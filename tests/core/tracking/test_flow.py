@@ -144,6 +144,31 @@ def test_propagate_takes_the_median_of_the_nearest() -> None:
     assert np.isnan(moved[2]).all()
 
 
+def test_a_point_that_is_nowhere_is_none() -> None:
+    random = np.random.default_rng(1)
+    points, displacement, queries = (random.uniform(0.0, 50.0, (n, 2)) for n in (40, 40, 25))
+    expected = propagate(points, displacement, queries, radius=20.0)
+    for row in (0, 17, 40):
+        for nowhere in ([np.nan, np.nan], [np.nan, 3.0], [3.0, np.nan]):
+            more = np.insert(points, row, nowhere, axis=0), np.insert(displacement, row, [7.0, 7.0], axis=0)
+            np.testing.assert_array_equal(propagate(*more, queries, radius=20.0), expected)
+        more = np.insert(points, row, [25.0, 25.0], axis=0), np.insert(displacement, row, np.nan, axis=0)
+        np.testing.assert_array_equal(propagate(*more, queries, radius=20.0), expected)
+
+
+def test_lists_of_points_that_differ_in_length_are_refused() -> None:
+    image = shifted(texture(), 0.0, 0.0)
+    points = image.cells.points
+    for guess in (points[:-1], points[:, :1], points.ravel()):
+        with pytest.raises(ValueError, match="of one length"):
+            LucasKanade().match(image, image, points, guess)
+    with pytest.raises(ValueError, match="of one length"):
+        LucasKanade().match(image, image, points.ravel(), points)
+    for displacement, queries in ((points[:-1], points), (points, points.ravel()), (points, points[:, :1])):
+        with pytest.raises(ValueError, match="values"):
+            propagate(points, displacement, queries)
+
+
 def test_half_size_fields_are_sampled_at_full_size() -> None:
     v, u = np.mgrid[:8, :10].astype(np.float32)
     field = np.stack([2 * u + 0.5, 2 * v + 0.5], axis=-1)  # the full-size position of each half-size pixel
