@@ -147,18 +147,29 @@ def _say(outcome: Outcome, screen: Screen, output: Output) -> None:
     for failure in (*outcome.observers, *([outcome.failed] if outcome.failed else [])):
         lines = [f"\n{failure.node} failed: {failure.error}", f"log: {failure.log}", failure.traceback]
         say("\n".join(filter(None, lines)), sys.stderr)
-    if not outcome.whole:
+    if outcome.whole:
+        screen.note(summary(output.path))
+    else:
         if outcome.failed is None:
             screen.note(outcome.reason)
-        screen.note(unfinished(output))
-        return
-    screen.note(summary(output.path))
+        screen.note(elsewhere(outcome.unseen, output) if outcome.unseen else unfinished(output))
     for node, reason in outcome.nothing.items():
         screen.note(f"nothing to show: {node}: {reason}")
+    if not outcome.whole:
+        return
     for failure in outcome.observers:
         screen.note(f"the map is finished, but {failure.node} failed: {failure.error}")
     if output.resume:
         screen.note(f"its report is still to be made: {output.resume}")
+
+
+def elsewhere(stages: Sequence[str], output: Output) -> str:
+    """Where the results of stages are that may still work: who goes on with the run beside one does its work twice."""
+    there = "still works, or has ended, where it was started: what it makes is there"
+    lines = ["", *(f"{name} {there}" for name in stages)]
+    if output.resume:
+        lines.append(f"if it did not end well: {output.resume}")
+    return "\n".join(lines)
 
 
 def unfinished(output: Output) -> str:

@@ -34,6 +34,7 @@ class Outcome:
     observers: tuple[Failure, ...] = ()  # who failed alone
     nothing: Mapping[str, str] = field(default_factory=dict)  # reasons by node for an empty result, in graph order
     cut_off: Mapping[str, str] = field(default_factory=dict)  # what Ctrl-C left of a source's stream, by node
+    unseen: tuple[str, ...] = ()  # external stages that may still work: all others reached their end
 
     @property
     def whole(self) -> bool:

@@ -1,7 +1,7 @@
 """The directory of a run's results: one run at a time, nothing of two runs mixed, a report that is always true.
 
 `report.json` says `"finished": false` from the start, so that it holds whatever befalls the launcher; the evaluator's
-own report takes its place at the end.
+own report takes its place at the end, still with `false` where a stage elsewhere may still work.
 """
 
 from __future__ import annotations
@@ -73,8 +73,9 @@ class Output:
             raise GraphError(f"output={self.path}: {error.strerror or error}") from error
 
     def settle(self, outcome: Outcome, *, scored: bool = False, keep: bool = True) -> str | None:
-        """Writes how the run ended, where no evaluator's report does. `scored`: the graph has who writes one. What the
-        run could go on from goes once nothing is left to do, unless it is to be kept.
+        """Writes how the run ended, where no evaluator's report does; over that report, too, where the end of a stage
+        elsewhere is not known. `scored`: the graph has who writes one. What the run could go on from goes once nothing
+        is left to do, unless it is to be kept.
 
         What went wrong where that cannot be written, else None.
         """
@@ -90,12 +91,12 @@ class Output:
         alone = {failure.node: failure.error for failure in outcome.observers}
         said = {"observers": alone, "nothing": dict(outcome.nothing), "cut_off": dict(outcome.cut_off)}
         beside = {key: by_node for key, by_node in said.items() if by_node}
-        report = read_report(self.path)
-        if report and report.get("finished", True):
-            if not beside.items() <= report.items():
-                self.write_report(report | beside)
+        there = read_report(self.path)
+        if there and there.get("finished", True) and not outcome.unseen:
+            if not beside.items() <= there.items():
+                self.write_report(there | beside)
             return
-        report = {"finished": False, "reason": outcome.reason, **beside}
+        report = {**there, "finished": False, "reason": outcome.reason, **beside}
         if outcome.failed:
             report |= {"failed": outcome.failed.node, "error": outcome.failed.error}
         if outcome.whole:

@@ -172,17 +172,19 @@ class Supervisor:
         cut_off, nothing = self._said("cut_off"), self._said("nothing")
         # where there is nothing to show, the footage is not all that there is to blame
         ended = finished(tuple(self._failed_observers.values()), cut_off | nothing if nothing else {}, cut_off)
-        unseen = "; ".join(f"{name} is external: its end is not known here" for name in self._unseen())
-        return replace(ended, code=FAILED, reason=unseen) if unseen else ended
+        if not (unseen := self._unseen()):
+            return ended
+        reason = "; ".join(f"{name} is external: its end is not known here" for name in unseen)
+        return replace(ended, code=ended.code if nothing else FAILED, reason=reason, unseen=unseen)
 
-    def _unseen(self) -> list[str]:
+    def _unseen(self) -> tuple[str, ...]:
         """The external stages that no node here has heard to the end, itself or by others."""
         slots, sources = self._graph.slots, self._graph.sources
         heard = {name for name in self._children if name not in self._failed_observers}
         for name in reversed(slots):  # readers come after their senders
             if any(edge.reader in heard and edge.reader not in sources for edge in self._graph.out_of(name)):
                 heard.add(name)
-        return [name for name in slots if name not in heard and name not in self._graph.observers]
+        return tuple(name for name in slots if name not in heard and name not in self._graph.observers)
 
     def _said(self, key: str) -> dict[str, str]:
         """A value that is text, by node, of those that have it, in the graph's order."""

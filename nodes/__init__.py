@@ -16,10 +16,10 @@ The parameter's type declares the input, the yielded type the output. Hooks:
 - `on_idle(self) -> list[U] | None`: one slice (well under 100 ms) of background work while no message waits;
   None when there is nothing to do now: it is asked again after the next message, or a quarter of a second.
 - `on_end(self) -> Iterator[U]`: every input has ended.
-- `on_abort(self, reason)`: the run ends early for this node, by SIGTERM, a lost neighbor or an exception of its own:
-  save what must not be lost, within 3 s, or be killed. Called once, between two hooks, at a `yield` of one or in a call
-  of `self.rest()`, which a hook that works for long makes where nothing is half changed (after an exception, where that
-  left the node); nothing can be sent any more.
+- `on_abort(self, reason)`: the run ends early for this node, by SIGTERM, a second SIGINT where it was started by hand,
+  a lost neighbor or an exception of its own: save what must not be lost, within 3 s, or be killed. Called once, between
+  two hooks, at a `yield` of one or in a call of `self.rest()`, which a hook that works for long makes where nothing is
+  half changed (after an exception, where that left the node); nothing can be sent any more.
 - `check(cls, config)`: before any process starts, on the launcher's machine: raises OSError or ValueError, saying what
   to do, where it is plain that the node cannot run (its file is missing, or cannot be read). A source opens its input
   and reads one frame of it, no more: quick, and nothing is written or sent.

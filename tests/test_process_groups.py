@@ -14,6 +14,7 @@ import pytest
 
 from launch.children import Child
 from launch.status import NodeStatus
+from tests.support.launches import lives
 from tests.support.patience import until
 
 pytestmark = pytest.mark.slow
@@ -56,8 +57,9 @@ def test_what_a_node_has_started_goes_with_it(tmp_path: Path, monkeypatch: pytes
 
     monkeypatch.setattr(subprocess, "Popen", instead)
     child = Child(NodeStatus("a"), tmp_path / "none.json", os.pipe(), tmp_path / "a.log", {})
+    until(lambda: (tmp_path / "a.log").read_text().endswith("\n"))
+    started = psutil.Process(int((tmp_path / "a.log").read_text()))  # it goes once its node's end was asked for
     child.wait()
     assert child.code == 0
-    started = int((tmp_path / "a.log").read_text())
-    until(lambda: not psutil.pid_exists(started) or psutil.Process(started).status() == psutil.STATUS_ZOMBIE)
+    until(lambda: not lives(started))
     child.close()

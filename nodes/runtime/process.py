@@ -4,7 +4,7 @@ Life: start, wait for the readers of its topics, ask for a camera's frames, run,
 source: once `run` is exhausted, or SIGINT has come), End on each topic, wait for the goodbyes, done. A failure at any
 point is reported, with its traceback unless it is of bad input, which its message explains; the node saves what it has
 (`on_abort`), and the process ends with exit code 1; the neighbors notice and fail as well. SIGTERM ends it in the same
-way at the next safe point, with exit code 143.
+way at the next safe point, with exit code 143; so does a second SIGINT where it was started by hand, with 130.
 """
 
 from __future__ import annotations
@@ -149,13 +149,13 @@ class _Process:
                 self._wait(inbox, self._publishers[given.type])
         began = time.monotonic()
         for given in self._spec.outputs:
-            publisher = self._publishers[given.type]
-            while not publisher.ready(given.readers, awaited := self._spec.awaited_observers(given)):
-                if given.patience and time.monotonic() - began > given.patience:
-                    missing = ", ".join(sorted(set(awaited) - publisher.observers.keys()))
-                    self._say(f"{publisher.topic} begins without {missing}: not there after {given.patience:g} s")
-                    break
+            publisher, over = self._publishers[given.type], False
+            while not publisher.ready(given.readers, () if over else self._spec.awaited_observers(given)):
                 self._wait(inbox, publisher)
+                over = 0 < given.patience < time.monotonic() - began
+            missing = ", ".join(sorted(set(self._spec.awaited_observers(given)) - publisher.observers.keys()))
+            if missing:
+                self._say(f"{publisher.topic} begins without {missing}: not there after {given.patience:g} s")
 
     def _rest(self) -> None:
         """In the midst of a hook's long work."""

@@ -16,11 +16,28 @@ from typing import Any
 import psutil
 import pytest
 
-from tests.support.patience import LONG
+from tests.support.patience import LONG, Stopwatch
 
 ROOT = Path(__file__).resolve().parents[2]
 FAKE = ROOT / "tests" / "support" / "fake_graph" / "conf"
-DOWN = 5.0  # seconds in which a graph must be gone
+DOWN = 5.0  # seconds in which the nodes of a graph must be gone
+
+
+def lives(process: psutil.Process) -> bool:
+    try:
+        return bool(process.is_running() and process.status() != psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
+        return False
+
+
+def gone(processes: Sequence[psutil.Process], seconds: float) -> bool:
+    """Whether all of them are in that time from now: nothing else is waited for."""
+    watch = Stopwatch()
+    while any(map(lives, processes)):
+        if not watch.within(seconds):
+            return False
+        time.sleep(0.01)
+    return True
 
 
 class Launch:
@@ -36,6 +53,7 @@ class Launch:
     ) -> None:
         """prefix: what the command is preceded by, such as a host that it runs on."""
         self.output = folder / "out"
+        self._nodes: list[psutil.Process] = []  # as of when the graph was up
         self.sockets = sockets or Path(tempfile.mkdtemp(prefix="t", dir="/tmp"))  # short: a socket's path must fit
         self.process = subprocess.Popen(
             [
@@ -86,14 +104,26 @@ class Launch:
 
     def wait_until_running(self) -> None:
         """Until the sink's log says so, and every node's that it is past its start: they come up in any order."""
-        until = time.monotonic() + LONG
+        limit = time.monotonic() + LONG
         logs = self.output / "logs"
-        while time.monotonic() < until and self.process.poll() is None:
+        while True:
+            over = (
+                self.process.poll() is not None or time.monotonic() > limit
+            )  # asked first: it may be up and have ended
+            self._nodes = [] if over else psutil.Process(self.process.pid).children()
             said = {log.stem: log.read_text() for log in logs.glob("*.log")}
             if "running" in said.get("sink", "") and all("waiting" in text for text in said.values()):
                 return
+            assert not over, f"the graph did not come up: {self.process.communicate(timeout=10)}"
             time.sleep(0.05)
-        raise AssertionError(f"the graph did not come up: {self.process.communicate(timeout=10)}")
+
+    def living(self) -> list[psutil.Process]:
+        """Of the nodes that were there when the graph was up."""
+        return [node for node in self._nodes if lives(node)]
+
+    def goes_down(self, seconds: float = DOWN) -> bool:
+        """Whether all nodes are gone in that time from now. What the launcher then says takes as long as it takes."""
+        return gone(self._nodes, seconds)
 
     def ctrl_c(self) -> None:
         """As a terminal does it: to all processes of the foreground group."""

@@ -28,16 +28,17 @@ class SlowToSave(Relay):
 
 
 class SlowToEnd(Sink):
-    """Works for long once its inputs have ended, as a mapper refines; then writes what a sink does."""
+    """Works on once its inputs have ended, as a mapper refines, until `goes` is there; then writes what a sink does."""
 
     @dataclass
     class Config(Sink.Config):
-        seconds: float = 3.0
+        goes: Path = Path("goes")
 
     config: Config
 
     def on_end(self) -> Iterator[None]:
-        time.sleep(self.config.seconds)
+        while not self.config.goes.exists():
+            time.sleep(0.01)
         yield from super().on_end()
 
 
