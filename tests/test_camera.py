@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.server
+import re
 import sys
 import threading
 import time
@@ -10,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -22,50 +24,10 @@ from msgs import Frame, GroundTruth
 from mvsgs_core.stats import Stats
 from nodes.camera import Camera, CameraError
 from nodes.stream_presence import Presence, pauses
+from tests.support.fake_camera import FakeCapture, capture
+from tests.support.patience import until
 
-
-class FakeCapture:
-    """Stands for cv2.VideoCapture: a picture every `interval` seconds, gray with its number; `script` may fail."""
-
-    interval = 0.01
-    lost_after: int | None = None  # pictures, then no more until opened again
-    dead_after: int | None = None  # pictures over all captures, then never again
-    count = -2.8e11  # frames, as OpenCV counts those of a stream without an end
-    opened = 0
-    pictures = 0
-
-    def __init__(self, *arguments: object) -> None:
-        type(self).opened += 1
-        self._own = 0
-
-    def isOpened(self) -> bool:
-        return self.dead_after is None or self.pictures < self.dead_after
-
-    def read(self) -> tuple[bool, np.ndarray | None]:
-        time.sleep(self.interval)
-        if not self.isOpened() or (self.lost_after is not None and self._own >= self.lost_after):
-            return False, None
-        self._own += 1
-        type(self).pictures += 1
-        return True, np.full((48, 64, 3), (0, 0, self.pictures % 256), dtype=np.uint8)
-
-    def set(self, *_: object) -> bool:
-        return True
-
-    def get(self, what: int) -> float:
-        return self.count if what == cv2.CAP_PROP_FRAME_COUNT else 0.0
-
-    def release(self) -> None:
-        pass
-
-
-@pytest.fixture
-def capture(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[FakeCapture]]:
-    kind = type("Capture", (FakeCapture,), {})
-    monkeypatch.setattr(nodes.camera.cv2, "VideoCapture", kind)
-    monkeypatch.setattr(nodes.stream_presence, "FIRST_PAUSE", 0.01)
-    yield kind
-    assert not [t for t in threading.enumerate() if t.name == "camera"], "the capture thread outlived its node"
+__all__ = ["capture"]  # the fixture
 
 
 def test_camera_delivers_frames_with_guessed_intrinsics(capture: type[FakeCapture]) -> None:
@@ -84,20 +46,18 @@ def test_camera_delivers_frames_with_guessed_intrinsics(capture: type[FakeCaptur
     assert any("guess" in w for w in camera.stats.warnings)
 
 
-@pytest.mark.slow
 def test_a_slow_reader_gets_the_newest_picture_and_the_rest_is_counted(capture: type[FakeCapture]) -> None:
     camera = Camera(Camera.Config(stop=5, intrinsics=[50, 50, 31.5, 23.5]))
-    lag = []
-    seen = 0
+    seen: list[int] = []
     for message in camera.run():
         if isinstance(message, Frame):
-            seen = int(message.image[0, 0, 0])
-            lag.append(capture.pictures - seen)
-            time.sleep(0.15)
+            seen.append(int(message.image[0, 0, 0]))
+            capture.gate.release(14)  # with the one that came as this was taken, 15 meanwhile
+            until(lambda: camera._feed.dropped == 14 * len(seen))
     assert camera.stats.warnings == []
     assert camera.stats.counts["frames"] == 5
-    assert max(lag) <= 2  # never an old picture, although some 15 were taken meanwhile
-    assert camera.stats.counts["dropped"] >= seen - 5 > 10
+    assert seen == [1, 16, 31, 46, 61]  # never an old picture
+    assert camera.stats.counts["dropped"] == 4 * 14
 
 
 @pytest.mark.parametrize(("path", "asked"), [("2", (2,)), ("/dev/video2", (2,)), ("rtsp://host/2", ("rtsp://host/2",))])
@@ -143,37 +103,41 @@ def test_a_camera_that_comes_back_goes_on_and_both_are_told_at_once(capture: typ
     capture.lost_after = 4
     camera = Camera(Camera.Config(stop=10))
     lost: list[int] = []  # warnings of it at each frame
+    began = time.monotonic()
     for message in camera.run():
         if isinstance(message, Frame):
             lost.append(len(told(camera, "camera 0 was lost")))
-    assert (lost[0], lost[-1]) == (0, 2)
+    took = time.monotonic() - began
+    assert (lost[:2], lost[4:6], lost[8:]) == ([0, 0], [1, 1], [2, 2])
     away, back = told(camera, "loss 1")
     assert away == "camera 0 was lost (it gives no picture; loss 1): it is waited for up to 30 s"
-    assert back.startswith("camera 0 is back after 0.")
+    assert re.fullmatch(r"camera 0 is back after \d+\.\d s \(loss 1\)", back)
     assert camera.stats.counts["frames"] == 10
     assert camera.stats.counts["lost"] == 2
-    assert 0 < camera.stats.counts["seconds_lost"] < 5
+    assert 0 < camera.stats.counts["seconds_lost"] < took
 
 
+@pytest.mark.slow
 def test_it_is_tried_again_at_growing_pauses_until_its_timeout(
     capture: type[FakeCapture], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(nodes.stream_presence, "FIRST_PAUSE", 0.02)
     capture.dead_after = 3
-    attempts: list[float] = []
-    opened = capture.__init__
+    waited: list[float] = []
 
-    def noted(self: FakeCapture, *arguments: object) -> None:
-        attempts.append(time.monotonic())
-        opened(self, *arguments)
+    class Noted(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            assert timeout is not None
+            waited.append(timeout)
+            return super().wait(0.01)
 
-    monkeypatch.setattr(capture, "__init__", noted)
+    parts = SimpleNamespace(Event=Noted, Condition=threading.Condition, Thread=threading.Thread)
+    monkeypatch.setattr(nodes.camera, "threading", parts)
     camera = Camera(Camera.Config(timeout=1.2))
     list(camera.run())
-    waited = [b - a for a, b in pairwise(attempts[1:])]
-    assert 4 <= len(waited) <= 9
-    assert all(b > 1.3 * a for a, b in pairwise(waited[:3]))
-    assert max(waited) < 0.6  # a quarter of the timeout, and what the machine adds
+    assert waited[:5] == pytest.approx([0.02, 0.04, 0.08, 0.16, 0.3])
+    assert set(waited[5:]) <= {0.3}  # a quarter of the timeout
+    assert len(waited) - capture.opened in (-1, 0)  # the last one may have been for the end
     assert camera.stats.warnings[-1] == "camera 0 gave no usable picture for 1.2 s: the stream ends here"
     assert camera.stats.counts["lost"] == 1
 
@@ -206,7 +170,7 @@ def test_a_camera_of_another_size_is_refused_until_it_has_its_own_again(capture:
     frames = [message for message in camera.run() if isinstance(message, Frame)]
     assert len(frames) == 7
     assert {frame.image.shape for frame in frames} == {(48, 64, 3)}
-    assert camera.stats.counts["other_size"] == camera.stats.counts["unusable"] >= 1
+    assert camera.stats.counts["other_size"] == camera.stats.counts["unusable"] == 4
     assert told(camera, "frames of another size than the first, (48, 64), were left out, such as (24, 64)")
     assert (cv2.CAP_PROP_FRAME_HEIGHT, 48) in asked  # as it was before it was lost
 
@@ -219,11 +183,10 @@ def test_a_picture_that_is_given_again_is_counted_and_refused(capture: type[Fake
         return good, None if picture is None else np.full_like(picture, int(picture.max()) // 4)
 
     capture.read = stuck  # type: ignore[method-assign]
-    camera = Camera(Camera.Config(stop=4, timeout=0.5))
+    camera = Camera(Camera.Config(stop=4))
     frames = [message for message in camera.run() if isinstance(message, Frame)]
-    assert [int(frame.image.max()) for frame in frames] == sorted({int(frame.image.max()) for frame in frames})
-    assert len(frames) == 4  # a picture that stands still is no lost camera
-    assert camera.stats.counts["doubled"] >= 3
+    assert [int(frame.image.max()) for frame in frames] == [0, 1, 2, 3]  # a picture that stands still is no lost camera
+    assert camera.stats.counts["doubled"] == 2 + 3 + 3
 
 
 def test_a_clock_that_is_set_does_not_move_the_stream(
@@ -241,15 +204,16 @@ def test_a_camera_that_hangs_is_told_before_it_is_given_up(capture: type[FakeCap
     read = capture.read
 
     def hanging(self: FakeCapture) -> tuple[bool, np.ndarray | None]:
-        if capture.pictures >= 3:
-            time.sleep(0.8)  # and then it comes to itself, for one picture
+        if capture.pictures in (3, 4):
+            until(lambda: told(camera, f"loss {capture.pictures - 2}"))  # and then it comes to itself, for one picture
         return read(self)
 
     capture.read = hanging  # type: ignore[method-assign]
-    camera = Camera(Camera.Config(timeout=1.0, stop=5))
+    camera = Camera(Camera.Config(timeout=2.0, stop=5))
     assert sum(isinstance(message, Frame) for message in camera.run()) == 5
-    assert told(camera, "camera 0 was lost (nothing came for 0.5 s; loss 1): it is waited for up to 1 s")
-    assert told(camera, "camera 0 is back after 0.")
+    assert told(camera, "camera 0 was lost (nothing came for 1 s; loss 1): it is waited for up to 2 s")
+    assert told(camera, "camera 0 is back after ")
+    assert camera.stats.counts["lost"] == 2
 
 
 def test_a_stream_of_few_frames_is_no_lost_one() -> None:

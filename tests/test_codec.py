@@ -11,7 +11,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import msgs
@@ -21,7 +21,7 @@ from tests.support.example_messages import MESSAGES, assert_equal, example
 from tests.support.shared_data import ROOT
 
 LIMIT = 4 * 2**20  # bytes of a message in the memory tests
-UNHURRIED = settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.too_slow])
+MORE = settings(max_examples=150)
 
 
 def frame(height: int = 48, width: int = 64) -> Frame:
@@ -245,7 +245,7 @@ def test_arrays_hold_only_what_their_type_allows() -> None:
     refused(encode(replace(trajectory, timestamp=times)), "timestamp is not finite")
 
 
-@UNHURRIED
+@MORE
 @given(st.binary(max_size=4096))
 def test_random_bytes_are_refused(data: bytes) -> None:
     for prefix in (b"", b"RMVS\x02\x05\0\0", b"RMVS\x02\x03\0\0" + struct.pack("<I", len(data)) + b"End"):
@@ -253,7 +253,7 @@ def test_random_bytes_are_refused(data: bytes) -> None:
             decode(prefix + data)
 
 
-@UNHURRIED
+@MORE
 @given(st.sampled_from(MESSAGES), st.integers(0, 5), st.data())
 def test_damage_gives_an_error_or_a_valid_message(message_type: type, seed: int, data: st.DataObject) -> None:
     original = bytes(encode(example(message_type, seed)))
@@ -292,7 +292,7 @@ HEADER_VALUES = st.recursive(
 
 
 @pytest.mark.slow
-@UNHURRIED
+@MORE
 @given(st.sampled_from(["sequence", "scalars", "arrays", "index", "timestamp", "image", "intrinsics"]), HEADER_VALUES)
 def test_any_value_anywhere_in_a_header_is_checked(key: str, value: Any) -> None:
     def change(content: dict[str, Any]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import tracemalloc
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -17,7 +18,7 @@ from hypothesis import strategies as st
 import msgs
 from bench.faults.frame_mutations import ESCAPES, frame, good, mutated, parts
 from msgs import End, Frame, SplatMap
-from msgs.codec import MAX_END_HEADER_BYTES, CodecError, decode, encode
+from msgs.codec import MAX_END_HEADER_BYTES, MAX_END_VALUES, CodecError, decode, encode
 from nodes import Stats
 
 GOOD = bytes(encode(Frame(1, 0.5, np.zeros((4, 4, 3), np.uint8), np.ones(4))))
@@ -104,6 +105,18 @@ def crowded_end(item: bytes, total: int, key: bytes = b"a") -> bytes:
     return with_bytes_at(("scalars", "stats"), stats, bytes(encode(End())))
 
 
+def thread_seconds(work: Callable[[], None]) -> float:
+    began = time.thread_time()
+    work()
+    return time.thread_time() - began
+
+
+def count() -> None:
+    """A step for each value that a header may have: what this interpreter does in a given time, now and here."""
+    for _ in range(MAX_END_VALUES):
+        pass
+
+
 @pytest.mark.parametrize(
     "data",
     [
@@ -128,12 +141,8 @@ def test_a_small_frame_takes_little_time_and_memory(data: bytes) -> None:
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak <= 64e6
-    seconds = []
-    for _ in range(3):
-        began = time.thread_time()
-        attempt()
-        seconds.append(time.thread_time() - began)
-    assert min(seconds) <= 0.05
+    decoding, counting = zip(*((thread_seconds(attempt), thread_seconds(count)) for _ in range(5)), strict=True)
+    assert min(decoding) <= 350 * min(counting)  # 50 ms, where one step takes 8 ns
 
 
 @pytest.mark.slow
@@ -152,7 +161,7 @@ values = st.recursive(
 
 
 @pytest.mark.slow
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(
     st.sampled_from(sorted(msgs.TYPES)), st.lists(st.tuples(st.integers(0, 30), values), max_size=4), st.integers(0, 3)
 )

@@ -7,12 +7,12 @@ import re
 import signal
 from pathlib import Path
 
+import psutil
 import pytest
 
 from bench.faults.kills import SCENE
 from bench.faults.launched import Launched, map_opens
-from tests.support.launches import DOWN
-from tests.support.patience import Stopwatch
+from tests.support.launches import DOWN, gone
 
 pytestmark = pytest.mark.slow
 
@@ -26,10 +26,10 @@ def test_a_run_whose_mapper_was_killed_leaves_a_map_and_is_resumed(tmp_path: Pat
     output = tmp_path / "out"
     with Launched(output, (*SHORT, f"output={output}")) as run:
         assert run.wait_for((output / "map.ply").exists), run.said()
-        watch = Stopwatch()
+        nodes = psutil.Process(run.process.pid).children()
         assert run.send("mapper", signal.SIGKILL)
+        assert gone(nodes, DOWN)
         assert run.wait() == 1
-        assert watch.within(DOWN)
         assert run.left() == []
         report, said = run.report(), run.said()
     assert map_opens(output)

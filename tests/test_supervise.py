@@ -14,7 +14,7 @@ import pytest
 from launch.status import NodeStatus
 from launch.summary import summary
 from tests.support.launches import DOWN, Launch, launch
-from tests.support.patience import LONG, Stopwatch, until
+from tests.support.patience import LONG, until
 
 pytestmark = pytest.mark.slow
 
@@ -22,6 +22,7 @@ __all__ = ["launch"]  # the fixture
 
 STREAM = ("source.count=150", "source.period=0.01")
 SHORT = ("supervise.silent=1.0", "supervise.dead=2.5")
+SECONDS = r"[1-9]\d* s"  # as many as the machine made of it: test_watchdog.py counts them by a clock of its own
 
 
 def test_an_observer_that_is_killed_fails_alone_and_is_named_at_once_and_at_the_end(launch: type[Launch]) -> None:
@@ -57,9 +58,11 @@ def test_an_observer_that_hangs_is_given_up_and_its_senders_go_on(launch: type[L
         run.node("sink").suspend()
     code, out, err = run.finish()
     assert code == 4, err
-    assert re.search(r"sink failed: (silent for \d s: it was stopped|it has held \w+ back for \d s)", out), out
-    held = r"sink has held \w+ back for 1 s; after 2.5 s the run goes on"
-    named = r"sink has been silent for \d s" if stopped else held
+    assert re.search(rf"sink failed: (silent for {SECONDS}: it was stopped|it has held \w+ back for {SECONDS})", out), (
+        out
+    )
+    held = rf"sink has held \w+ back for {SECONDS}; after 2.5 s the run goes on"
+    named = rf"sink has been silent for {SECONDS}" if stopped else held
     assert re.search(named, out), out
     assert "done" in (run.output / "logs" / "relay.log").read_text()
 
@@ -67,13 +70,13 @@ def test_an_observer_that_hangs_is_given_up_and_its_senders_go_on(launch: type[L
 def test_a_stage_that_is_stopped_is_named_and_ends_the_run(launch: type[Launch]) -> None:
     run = launch("source.count=0", "source.period=0.01", *SHORT)
     run.wait_until_running()
-    watch = Stopwatch()
     run.node("relay").suspend()
+    assert run.goes_down(2.5 + DOWN)
     code, out, err = run.finish()
-    assert watch.within(2.5 + DOWN)
     assert code == 1
-    assert re.search(r"relay has been silent for \d s: its process was stopped \(kill -CONT \d+ lets it go on\)", out)
-    assert re.search(r"relay failed: silent for \d s: it was stopped by a signal", err)
+    stopped = rf"relay has been silent for {SECONDS}: its process was stopped \(kill -CONT \d+ lets it go on\)"
+    assert re.search(stopped, out), out
+    assert re.search(rf"relay failed: silent for {SECONDS}: it was stopped by a signal", err), err
     assert run.report() | {"written": ""} == {
         "finished": False,
         "reason": f"relay failed: {run.report()['error']}",
@@ -88,7 +91,7 @@ def test_a_stage_whose_process_hangs_is_named_with_where_it_stands(launch: type[
     run = launch("source.count=20", "relay.long_at=5", "relay.long=1000", "relay.how=locked", *SHORT)
     code, out, err = run.finish()
     assert code == 1
-    assert re.search(r"relay has been silent for \d s: its process hangs; after 2.5 s the run ends\.", out), out
+    assert re.search(rf"relay has been silent for {SECONDS}: its process hangs; after 2.5 s the run ends\.", out), out
     assert "in take" in out
     assert "relay failed: silent for" in err
 
@@ -99,8 +102,10 @@ def test_a_slow_stage_is_not_a_dead_one(launch: type[Launch], how: str) -> None:
     run = launch("source.count=8", "relay.long_at=5", "relay.long=5", f"relay.how={how}", *limits)
     code, out, err = run.finish()
     assert code == 0, out + err
-    assert "silent" not in out
-    assert "relay has been at the same piece of work for 2 s; it is alive, so it is left alone" in out
+    assert not re.search("relay (has been silent|failed)", out), out
+    assert re.search(
+        rf"relay has been at the same piece of work for {SECONDS}; it is alive, so it is left alone", out
+    ), out
 
 
 def test_a_launcher_that_was_stopped_itself_takes_nobody_for_dead(launch: type[Launch]) -> None:
@@ -111,17 +116,16 @@ def test_a_launcher_that_was_stopped_itself_takes_nobody_for_dead(launch: type[L
     run.process.send_signal(signal.SIGCONT)
     code, out, err = run.finish()
     assert code == 0, err
-    assert "silent" not in out
+    assert not re.search("(source|relay|sink) (has been silent|failed)", out), out
 
 
 @pytest.mark.parametrize("victim", ["source", "relay", "sink"])
 def test_a_stage_ended_from_outside_ends_the_run_in_time(launch: type[Launch], victim: str) -> None:
     run = launch("source=live")
     run.wait_until_running()
-    watch = Stopwatch()
     run.node(victim).terminate()
+    assert run.goes_down()
     code, out, err = run.finish()
-    assert watch.within(DOWN)
     assert code == 1
     assert f"{victim} failed: stopped (SIGTERM)" in err
     assert out.rstrip().endswith(f"nothing to go on with in {run.output}: run it again")

@@ -2,30 +2,30 @@
 
 from __future__ import annotations
 
-import os
-import socket
+import subprocess
+import sys
 
 import pytest
 
-pytest.importorskip("cyclonedds")
+from tests.support.shared_data import ROOT
 
+pytest.importorskip("cyclonedds")
+pytestmark = pytest.mark.slow
+
+BOUND_TWICE = """
+import os, socket
 from nodes.ros2.dds import _bind
 
 NOBODY = 65534
+with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as own:
+    if os.geteuid() == 0:
+        os.setuid(NOBODY)
+    for _ in range(2):
+        _bind(own.fileno(), "lo")
+"""
 
 
 def test_a_socket_that_is_bound_already_needs_no_privilege() -> None:
     """Participants of one process share Cyclone's sockets, which each of them confines."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as own:
-        child = os.fork()
-        if child == 0:
-            code = 1
-            try:
-                if os.geteuid() == 0:
-                    os.setuid(NOBODY)
-                for _ in range(2):
-                    _bind(own.fileno(), "lo")
-                code = 0
-            finally:
-                os._exit(code)
-        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    done = subprocess.run([sys.executable, "-c", BOUND_TWICE], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

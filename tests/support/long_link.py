@@ -9,12 +9,14 @@ from __future__ import annotations
 import ctypes
 import fcntl
 import os
+import signal
 import socket
 import struct
 import subprocess
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from queue import SimpleQueue
@@ -28,6 +30,7 @@ from nodes.runtime.transport import LivePublisher, LiveReader, create_keys
 COUNT, INTERVAL = 60, 1 / 30  # frames of nearly a megabyte: 28 MB/s
 DELAY = 0.02  # s one way
 NOT_PERMITTED = 77
+GO, NO = b"!", b"."
 PUBLISHER, READER = "10.9.0.1", "10.9.0.2"
 ADDRESS = f"tcp://{PUBLISHER}:5555"
 NEW_NETWORK, MAKE_DEVICE, PACKETS_ALONE = 0x40000000, 0x400454CA, 0x1001  # CLONE_NEWNET, TUNSETIFF, TUN without a head
@@ -51,27 +54,38 @@ def read(keys: Keys) -> None:
     print(count, flush=True)
 
 
+def device(address: str) -> int:
+    """The descriptor of the one device of a network namespace of this process's own. Raises OSError and
+    SubprocessError where that is not permitted."""
+    if ctypes.CDLL(None, use_errno=True).unshare(NEW_NETWORK):
+        raise OSError(ctypes.get_errno(), "unshare")
+    made = os.open("/dev/net/tun", os.O_RDWR)
+    fcntl.ioctl(made, MAKE_DEVICE, struct.pack("16sH", b"tun0", PACKETS_ALONE))
+    for words in (f"address add {address}/24 dev tun0", "link set tun0 mtu 60000 txqueuelen 5000 up"):
+        subprocess.run(["ip", *words.split()], check=True, timeout=20)
+    return made
+
+
 def host(address: str, end: socket.socket, act: Callable[[Keys], None], keys: Keys) -> int:
-    """A process of its own, which sends its device's descriptor through `end` and begins when it is answered."""
+    """A process of its own, which sends its device's descriptor through `end` and begins when it is told to."""
     process = os.fork()
     if process:
         return process
     code = 1
     try:
-        if ctypes.CDLL(None, use_errno=True).unshare(NEW_NETWORK):
-            raise PermissionError
-        device = os.open("/dev/net/tun", os.O_RDWR)
-        fcntl.ioctl(device, MAKE_DEVICE, struct.pack("16sH", b"tun0", PACKETS_ALONE))
-        for words in (f"address add {address}/24 dev tun0", "link set tun0 mtu 60000 txqueuelen 5000 up"):
-            subprocess.run(["ip", *words.split()], check=True, timeout=20)
-        socket.send_fds(end, [b"here"], [device])
-        end.recv(1)
-        act(keys)
-        code = 0
-    except (OSError, subprocess.SubprocessError) as error:
-        print(f"{address}: {error}", file=sys.stderr)
-        code = NOT_PERMITTED
+        try:
+            own = [device(address)]
+        except (OSError, subprocess.SubprocessError) as error:
+            print(f"{address}: {error}", file=sys.stderr)
+            own = []
+        socket.send_fds(end, [b"here"], own)
+        if end.recv(1) == GO:
+            act(keys)
+        code = 0 if own else NOT_PERMITTED
+    except Exception:
+        traceback.print_exc()
     finally:
+        sys.stderr.flush()
         os._exit(code)
 
 
@@ -97,19 +111,40 @@ def main(folder: Path) -> int:
         host(PUBLISHER, pairs[0][1], publish, keys),
         host(READER, pairs[1][1], read, keys),
     ]
-    devices: list[int] = []
-    for ours, theirs in pairs:
-        theirs.close()
-        devices += socket.recv_fds(ours, 4, 1)[1]
-    if len(devices) == 2:
+    devices = [device for ours, _ in pairs for device in socket.recv_fds(ours, 4, 1)[1]]
+    both = len(devices) == 2
+    if both:
         for source, target in (devices, devices[::-1]):
             threading.Thread(target=carry, args=(source, target), daemon=True).start()
-        for ours, _ in pairs:
-            ours.send(b"!")
-    return max(os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) for process in processes)
+    for ours, _ in pairs:
+        ours.send(GO if both else NO)
+    return verdict(exit_codes(processes))
+
+
+def exit_codes(processes: list[int]) -> list[int]:
+    """Of all of them; where one failed, the others, which would wait for it, are ended."""
+    codes, left = [], set(processes)
+    while left:
+        process, status = os.wait()
+        left.discard(process)
+        codes.append(os.waitstatus_to_exitcode(status))
+        if codes[-1] not in (0, NOT_PERMITTED):
+            for other in left:
+                os.kill(other, signal.SIGKILL)
+    return codes
+
+
+def verdict(codes: list[int]) -> int:
+    """Of the hosts' exit codes, below 0 for signals: not permitted only where nothing else went wrong."""
+    failed = {code for code in codes if code}
+    return 0 if not failed else NOT_PERMITTED if failed == {NOT_PERMITTED} else 1
+
+
+def run() -> None:
+    code = main(Path(sys.argv[1]))
+    sys.stdout.flush()
+    os._exit(code)  # the threads wait for packets
 
 
 if __name__ == "__main__":
-    CODE = main(Path(sys.argv[1]))
-    sys.stdout.flush()
-    os._exit(CODE)  # the threads wait for packets
+    run()

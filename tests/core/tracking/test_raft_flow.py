@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,15 +15,19 @@ SHIFT = np.array([21.0, -13.0])
 
 
 def pair() -> tuple[TrackingImage, TrackingImage]:
-    """A texture and the same texture, moved by SHIFT."""
-    coarse = np.random.default_rng(0).integers(0, 255, (40, 50, 3), dtype=np.uint8)
-    texture = np.kron(coarse, np.ones((6, 6, 1), np.uint8))
+    """A texture and the same texture, moved by SHIFT.
+
+    It is smooth: on hard edges of chance the network is two to four times as far off, and how far hangs on the last
+    bits of its sums, which differ from one processor to the next and even between two runs.
+    """
+    coarse = np.random.default_rng(0).integers(0, 255, (20, 25, 3), dtype=np.uint8)
+    texture = np.asarray(cv2.resize(coarse, (300, 240), interpolation=cv2.INTER_CUBIC))
     x, y = SHIFT.astype(int)
     first, second = texture[30:158, 40:232], texture[30 - y : 158 - y, 40 - x : 232 - x]
     return tuple(TrackingImage.of(n, 0.0, i.copy(), (128, 192), True) for n, i in enumerate((first, second)))  # type: ignore[return-value]
 
 
-@pytest.mark.parametrize(("kind", "allowed"), [(RaftFlow, 0.6), (RefinedRaftFlow, 0.05)])
+@pytest.mark.parametrize(("kind", "allowed"), [(RaftFlow, 0.3), (RefinedRaftFlow, 0.05)])
 def test_finds_a_large_motion_without_a_guess(kind: type[RaftFlow], allowed: float) -> None:
     flow = kind(weights=str(shared("weights/raft-small.pth")))
     assert flow.needs_color
