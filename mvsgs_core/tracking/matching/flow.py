@@ -163,9 +163,9 @@ def propagate(
 
 def sample_field(field: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Half-size flow field (H, W, 2) at full-size points (N, 2), bilinear, clamped to the border."""
-    at = ((points.astype(np.float32) + 0.5) * 0.5 - 0.5).reshape(-1, 1, 2)
-    at = np.nan_to_num(at, nan=0.0)
-    sampled = cv2.remap(field, at, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    at = np.nan_to_num((points.astype(np.float32) + 0.5) * 0.5 - 0.5, nan=0.0)
+    x, y = np.ascontiguousarray(at.T)[:, None]  # two maps: see `raft_flow`, of one OpenCV 5 may read past its end
+    sampled = cv2.remap(field, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(sampled).reshape(-1, 2).astype(np.float64)
 
 

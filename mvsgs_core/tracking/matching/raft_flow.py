@@ -107,8 +107,9 @@ def _color(image: TrackingImage) -> np.ndarray:
 
 def _sample(flow: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(N, 2) of a flow (2, H, W) at points, bilinear."""
-    at = points.astype(np.float32).reshape(-1, 1, 2)
-    found = [cv2.remap(part, at, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for part in flow]
+    # two maps: of one with an empty second one OpenCV 5 reads memory that is not there
+    x, y = points.astype(np.float32).T[:, None]
+    found = [cv2.remap(part, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for part in flow]
     return np.stack([np.asarray(part).reshape(-1) for part in found], axis=1).astype(np.float64)
 
 
