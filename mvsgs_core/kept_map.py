@@ -22,13 +22,14 @@ def tracker_file(output: Path | str) -> Path:
     return Path(output) / FOLDER / TRACKER
 
 
-def check_no_map(output: Path | str) -> None:
+def check_no_map(output: Path | str, *, returned: bool = False) -> None:
     """Raises ValueError, saying what to do, for a directory that has a map already: none is written over.
 
-    The tracker's half alone is none: who wrote it was killed before the other was there.
+    returned: by a tracker that was killed and started again, for whom its own half alone is none: it did not get
+    farther.
     """
     folder = Path(output) / FOLDER
-    if folder.is_dir() and any(file.name != TRACKER for file in folder.iterdir()):
+    if folder.exists() and not (returned and [file.name for file in folder.iterdir()] == [TRACKER]):
         raise ValueError(f"{output}: there is a map already; give another folder")
 
 

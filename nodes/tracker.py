@@ -164,7 +164,7 @@ class Tracker(TrackerNode):
     def _save(self, folder: str) -> None:
         if not self.core.mapped:
             raise ValueError(NOTHING_MAPPED)
-        check_no_map(folder)
+        check_no_map(folder, returned=self._returning is not None and self._returning.returned)
         self.core.keep_map(tracker_file(folder))
 
     def _go_on_with(self, core: CoreTracker, request: Request) -> None:
