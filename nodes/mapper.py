@@ -26,10 +26,11 @@ from mvsgs_core.mapping.checkpoints.saved_map import SavedMap
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.losses import loss_function
-from mvsgs_core.mapping.mapper import FINAL_RATE, OnlineMapper
+from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mapping.preview import preview_arrays
 from mvsgs_core.mapping.provisional import Provisional
 from mvsgs_core.mapping.self_check import why_nothing
+from mvsgs_core.mapping.trainer import FINAL_RATE
 from mvsgs_core.pace import Effort, Pace
 from nodes import Node
 from nodes.last_seconds import LastSeconds

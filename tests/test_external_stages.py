@@ -18,7 +18,7 @@ from nodes.runtime.transport import NewestReader, Publisher
 from nodes.runtime.transport.readers import PEER_GRACE
 from tests.support.launches import DOWN, FAKE, Launch, launch
 from tests.support.patience import LONG, Stopwatch, until
-from tests.support.processes import graph
+from tests.support.processes import Graph, Process, graph
 
 pytestmark = pytest.mark.slow
 
@@ -156,15 +156,21 @@ def test_a_node_that_waits_for_its_readers_notices_that_its_sender_is_gone() -> 
         assert left.last["error"] == "PeerLost: the publisher of source.Frame disappeared before the end"
 
 
+def watched_source(g: Graph, patience: float) -> Process:
+    """Three frames for one reader and an observer that never comes, which is waited for so long."""
+    frames = {
+        "type": "Frame", "address": g.address("source.Frame"), "readers": 1, "observers": ["watcher"],
+        "patience": patience,
+    }  # fmt: skip
+    source = g.start("source", f"{SAMPLE}.Source", {}, {}, {"count": 3}, outputs=[frames])
+    source.wait_for(lambda status: status.get("state") == "waiting")
+    return source
+
+
 def test_an_observer_that_failed_on_another_host_is_not_waited_for_without_end() -> None:
     """Nobody can tell a node there that it is gone."""
     with graph() as g:
-        frames = {
-            "type": "Frame", "address": g.address("source.Frame"), "readers": 1, "observers": ["watcher"],
-            "patience": 1.0,
-        }  # fmt: skip
-        source = g.start("source", f"{SAMPLE}.Source", {}, {}, {"count": 3}, outputs=[frames])
-        source.wait_for(lambda status: status.get("state") == "waiting")
+        source = watched_source(g, 1.0)
         time.sleep(1.5)
         assert source.last["state"] == "waiting"  # those who make the map are waited for as long as they take
         left = g.start("left", f"{SAMPLE}.Left", {"Frame": "source"}, {})
@@ -175,12 +181,7 @@ def test_an_observer_that_failed_on_another_host_is_not_waited_for_without_end()
 
 def test_who_makes_the_map_and_leaves_while_an_observer_is_waited_for_is_waited_for_again() -> None:
     with graph() as g:
-        frames = {
-            "type": "Frame", "address": g.address("source.Frame"), "readers": 1, "observers": ["watcher"],
-            "patience": 4.0,
-        }  # fmt: skip
-        source = g.start("source", f"{SAMPLE}.Source", {}, {}, {"count": 3}, outputs=[frames])
-        source.wait_for(lambda status: status.get("state") == "waiting")
+        source = watched_source(g, 4.0)
         early = g.start("left", f"{SAMPLE}.Left", {"Frame": "source"}, {})
         early.wait_for(lambda status: status.get("state") == "running")
         time.sleep(1.0)  # it is counted

@@ -11,7 +11,8 @@ from torch import Tensor
 from launch.compose import compose
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.losses import LossInputs, name_of
-from mvsgs_core.mapping.mapper import FINAL_RATE, OnlineMapper
+from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.mapping.trainer import FINAL_RATE
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 KEYFRAMES, ITERATIONS, REFINEMENT = 4, 12, 48

@@ -25,12 +25,11 @@ from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.mapping.schedule import Schedule
 from mvsgs_core.mapping.self_check import SelfCheck, Shown, check
 from mvsgs_core.mapping.snapshot import snapshot
-from mvsgs_core.mapping.trainer import Trainer
+from mvsgs_core.mapping.trainer import FINAL_RATE, Trainer
 from mvsgs_core.rasterizer.rasterize import Render
 from mvsgs_core.stats import Stats
 
 LATE = 30  # part of the refinement's iterations that a keyframe's late splats bring: 1 / LATE
-FINAL_RATE = 0.1  # of the learning rates, with which a map is handed out
 NONE_NOW = 2  # halvings of an image from which on it gets no splats as it comes
 
 

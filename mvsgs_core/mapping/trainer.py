@@ -34,6 +34,7 @@ from mvsgs_core.rasterizer.rasterize import Render, chosen_backend, rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.stats import Stats
 
+FINAL_RATE = 0.1  # of the learning rates, with which a map is handed out
 UNSURE = 0.01  # standard deviation of the background in training: no splat can leave its own color to it
 WIDEST_NEW = 2 << LEVELS  # pixels of a side that a new splat may stand for: the largest rectangle at half the size
 FACTORS = 8  # images of vignetting that are kept, one for each size and intrinsics
@@ -218,7 +219,7 @@ class Trainer:
         How long both are, in an image's iterations, nobody knows before the stream has ended.
         """
         if refining:
-            return 50.0 - 50.0 * math.log10(self.rate)  # which falls from 1 to a tenth
+            return 50.0 + 50.0 * math.log(self.rate) / math.log(FINAL_RATE)  # by how far the rates have fallen
         return 0.5 * frequency_of(view.visits, self.config.budget)
 
     def _groups(self, median_depth: float, widest_new: float | None) -> list[optimizer.Group]:
