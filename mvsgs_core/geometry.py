@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # the axes of a camera; its own inverse
 _STILL = 1e-9  # of a position's magnitude: two that are nearer are the same
 
 
@@ -22,6 +25,18 @@ def rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, translation
     return pose
+
+
+def scaled(pose: np.ndarray, factor: float) -> np.ndarray:
+    """Poses (..., 4, 4), their lengths multiplied."""
+    result = np.array(pose, np.float64)
+    result[..., :3, 3] *= factor
+    return result
+
+
+def twist_scaled(twist: np.ndarray, factor: float) -> np.ndarray:
+    """Twists (..., 6) = (translation, rotation), their lengths multiplied."""
+    return np.asarray(twist * np.repeat([factor, 1.0], 3))
 
 
 def skew(v: np.ndarray) -> np.ndarray:
@@ -146,24 +161,60 @@ def moves(positions: np.ndarray) -> bool:
     return len(positions) > 0 and bool(np.ptp(positions, axis=0).max() > _STILL * (magnitude + 1.0))
 
 
-def umeyama(source: np.ndarray, target: np.ndarray, with_scale: bool = True) -> tuple[float, np.ndarray, np.ndarray]:
-    """Least-squares similarity: target = s R source + t (Umeyama 1991, eq. 40-42).
+@dataclass(frozen=True)
+class Similarity:
+    """X' = scale * rotation @ X + translation, float64."""
 
-    source, target: (N, 3). Returns (s, R (3, 3), t (3,)). Raises ValueError with fewer than 3 points, and where either
-    side has no extent.
+    scale: float
+    rotation: np.ndarray  # (3, 3)
+    translation: np.ndarray  # (3,)
+
+    @classmethod
+    def between(cls, old: np.ndarray, new: np.ndarray, scale: float) -> Similarity:
+        """What was seen from pose `old` (4, 4), its depths multiplied by `scale`, and put at pose `new`."""
+        rotation = new[:3, :3] @ old[:3, :3].T
+        return cls(scale, rotation, new[:3, 3] - scale * rotation @ old[:3, 3])
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Where points (N, 3) go, (N, 3)."""
+        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
+
+    def shifts(self, points: np.ndarray) -> np.ndarray:
+        """Distances (N,) by which points (N, 3) move."""
+        return np.asarray(np.linalg.norm(self.apply(points) - points, axis=1))
+
+    def moves(self, length: float, tolerance: float = 1e-6) -> bool:
+        """Whether a point within `length` moves by more than `tolerance` of it."""
+        change = abs(self.scale - 1.0) + float(np.abs(self.rotation - np.eye(3)).max())
+        return change + float(np.abs(self.translation).max()) / length > tolerance
+
+
+def umeyama(source: np.ndarray, target: np.ndarray) -> Similarity:
+    """From positions (N, 3) to others, by least squares (Umeyama 1991, eq. 40-42).
+
+    Raises ValueError with fewer than 3 positions, and where either side has no extent.
     """
     if len(source) < 3:
         raise ValueError(f"an alignment needs at least 3 positions, got {len(source)}")
     if not (moves(source) and moves(target)):
         raise ValueError("all positions coincide: no alignment")
-    mean_s, mean_t = source.mean(axis=0), target.mean(axis=0)
+    scale, rotation, translation = umeyama_of_each(source, target)
+    return Similarity(float(scale), rotation, translation)
+
+
+def umeyama_of_each(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """As `umeyama`, of sets (..., N, 3) that have an extent: scales (...), rotations (..., 3, 3) and translations
+    (..., 3)."""
+    mean_s, mean_t = source.mean(axis=-2, keepdims=True), target.mean(axis=-2, keepdims=True)
     ds, dt = source - mean_s, target - mean_t
-    variance = float(np.mean(np.sum(ds * ds, axis=1)))
-    u, d, vt = np.linalg.svd(dt.T @ ds / len(source))
-    s = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt)) or 1.0])
-    rotation = u @ np.diag(s) @ vt
-    scale = float(np.sum(d * s) / variance) if with_scale else 1.0
-    return scale, rotation, mean_t - scale * rotation @ mean_s
+    variance = np.mean(np.sum(ds * ds, axis=-1), axis=-1)
+    u, d, vt = np.linalg.svd(np.swapaxes(dt, -1, -2) @ ds / source.shape[-2])
+    sign = np.ones_like(d)
+    sign[..., 2] = np.where(np.linalg.det(u) * np.linalg.det(vt) < 0.0, -1.0, 1.0)
+    rotation = (u * sign[..., None, :]) @ vt
+    scale = np.sum(d * sign, axis=-1) / variance
+    moved = (scale[..., None, None] * rotation) @ np.swapaxes(mean_s, -1, -2)
+    return scale, rotation, mean_t[..., 0, :] - moved[..., 0]
 
 
 def left_multiplication(q: np.ndarray) -> np.ndarray:

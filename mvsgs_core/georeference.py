@@ -19,6 +19,7 @@ import numpy as np
 from mvsgs_core import geodesy, geometry
 from mvsgs_core.atomic_file import replace_text
 from mvsgs_core.bad_file import reading
+from mvsgs_core.geometry import Similarity
 
 FORMAT, VERSION = "mvsgs georeference", 1
 FILE = "georeference.json"
@@ -58,7 +59,7 @@ class Georeference:
 
     def world(self, positions: np.ndarray) -> np.ndarray:
         """(N, 3) m east, north, up of positions in the map (N, 3)."""
-        return np.asarray(self.scale * positions @ self.rotation.T + self.translation)
+        return Similarity(self.scale, self.rotation, self.translation).apply(positions)
 
     def poses(self, world_from_cam: np.ndarray) -> np.ndarray:
         """(N, 4, 4) poses in the frame of east, north and up, in metres."""
@@ -86,13 +87,13 @@ def georeference(world_from_cam: np.ndarray, places: np.ndarray, camera_up: bool
     target = geodesy.east_north_up(places, origin)
     if not geometry.moves(target):
         raise NoReferenceError(f"all {len(target)} GPS places are the same: the receiver gave none anew")
-    scale, rotation, translation, kept = _robust(positions, target)
+    similarity, kept = _robust(positions, target)
     if kept.sum() < max(FEWEST, len(kept) / 2):
         raise NoReferenceError(f"of {len(kept)} GPS places {int(kept.sum())} agree with the camera positions")
-    residual = scale * positions @ rotation.T + translation - target
+    residual = similarity.apply(positions) - target
     off = np.linalg.norm(residual, axis=1)
     noise = math.sqrt(float(np.sum(off[kept] ** 2)) / (3 * int(kept.sum()) - 7)) * _drift(residual, kept)
-    moved = scale * positions[kept] @ rotation.T
+    moved = similarity.apply(positions[kept])
     moved -= moved.mean(axis=0)
     extent, axes = np.linalg.eigh(moved.T @ moved)  # ascending
     scale_deviation = noise / math.sqrt(float(extent.sum()))
@@ -106,20 +107,19 @@ def georeference(world_from_cam: np.ndarray, places: np.ndarray, camera_up: bool
             f"known to {100.0 * scale_deviation:.0f} %, its direction to {min(about[1], 180.0):.0f} degrees"
         )
     if upright:
-        roll = _upright(axes[:, 2], rotation @ -world_from_cam[:, :3, 1].mean(axis=0))
+        roll = _upright(axes[:, 2], similarity.rotation @ -world_from_cam[:, :3, 1].mean(axis=0))
         center = positions[kept].mean(axis=0)
-        still = scale * rotation @ center + translation
-        rotation = roll @ rotation
-        translation = still - scale * rotation @ center
-        off = np.linalg.norm(scale * positions @ rotation.T + translation - target, axis=1)
+        still, rotation = similarity.apply(center[None])[0], roll @ similarity.rotation
+        similarity = Similarity(similarity.scale, rotation, still - similarity.scale * rotation @ center)
+        off = np.linalg.norm(similarity.apply(positions) - target, axis=1)
     elif angle > MAX_ANGLE:
         raise NoReferenceError(
             f"the camera positions lie nearly on a line, {length:.1f} m long: the rotation about it would be known to "
             f"{min(angle, 180.0):.0f} degrees. evaluator.camera_up=true takes it from cameras that were held upright"
         )
     return Georeference(
-        origin, scale, rotation, translation, len(kept), int((~kept).sum()), float(np.median(off)), float(off.max()),
-        scale_deviation, angle, noise / math.sqrt(int(kept.sum())), upright,
+        origin, similarity.scale, similarity.rotation, similarity.translation, len(kept), int((~kept).sum()),
+        float(np.median(off)), float(off.max()), scale_deviation, angle, noise / math.sqrt(int(kept.sum())), upright,
     )  # fmt: skip
 
 
@@ -139,7 +139,7 @@ def _drift(residual: np.ndarray, kept: np.ndarray) -> float:
     return math.sqrt((1.0 + alike) / (1.0 - alike))
 
 
-def _robust(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+def _robust(source: np.ndarray, target: np.ndarray) -> tuple[Similarity, np.ndarray]:
     """Similarity and (N,) bool of those that it was solved from."""
     count = len(source)
     if math.comb(count, 3) <= SAMPLES:
@@ -148,19 +148,19 @@ def _robust(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, 
         samples = np.random.default_rng(0).integers(count, size=(SAMPLES, 3))
     samples = samples[(np.ptp(source[samples], axis=1) > 0.0).any(axis=1)]
     samples = samples[(np.ptp(target[samples], axis=1) > 0.0).any(axis=1)]
-    found = _similarities(source[samples], target[samples])
+    scales, rotations, translations = geometry.umeyama_of_each(source[samples], target[samples])
     some = np.arange(0, count, -(-count // JUDGES))
-    off = np.einsum("sij,nj->sni", found[:, :3, :3], source[some]) + found[:, None, :3, 3] - target[some]
+    off = np.einsum("sij,nj->sni", scales[:, None, None] * rotations, source[some])
+    off += translations[:, None] - target[some]
     first = np.argsort(_usual(np.linalg.norm(off, axis=2)), kind="stable")[:BEST]
     gate = GATE * (1.0 + (FEW / (count - 3)) ** 2)
     smallest = 1e-6 * float(np.ptp(target, axis=0).max())  # below it is rounding
     best = None
-    for matrix in found[first]:
-        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-        solved = scale, matrix[:3, :3] / scale, matrix[:3, 3]
+    for n in first.tolist():
+        solved = Similarity(float(scales[n]), rotations[n], translations[n])
         kept = np.zeros(count, bool)
         for _ in range(20):
-            off = _off(source, target, solved)
+            off = np.linalg.norm(solved.apply(source) - target, axis=1)
             now = off <= max(gate * float(_usual(off)), smallest)
             if (now == kept).all():
                 break
@@ -168,12 +168,12 @@ def _robust(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, 
             if not (geometry.moves(source[kept]) and geometry.moves(target[kept])):
                 break
             solved = geometry.umeyama(source[kept], target[kept])
-        median = float(_usual(_off(source, target, solved)))
+        median = float(_usual(np.linalg.norm(solved.apply(source) - target, axis=1)))
         if best is None or median < best[0]:
             best = median, solved, kept
     if best is None:
         raise NoReferenceError("no three camera positions differ whose GPS places do")
-    return (*best[1], best[2])
+    return best[1], best[2]
 
 
 def _usual(off: np.ndarray) -> np.ndarray:
@@ -181,25 +181,6 @@ def _usual(off: np.ndarray) -> np.ndarray:
     so that it is the second after it."""
     rank = off.shape[-1] // 2 + 1
     return np.asarray(np.partition(off, rank, axis=-1)[..., rank])
-
-
-def _similarities(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """(S, 4, 4) [s R | t] of samples (S, 3, 3) of three positions each, as `geometry.umeyama` of each."""
-    mean_s, mean_t = source.mean(axis=1, keepdims=True), target.mean(axis=1, keepdims=True)
-    ds, dt = source - mean_s, target - mean_t
-    u, d, vt = np.linalg.svd(np.swapaxes(dt, 1, 2) @ ds)
-    sign = np.ones_like(d)
-    sign[:, 2] = np.where(np.linalg.det(u) * np.linalg.det(vt) < 0, -1.0, 1.0)
-    scale = np.sum(d * sign, axis=1) / np.sum(ds**2, axis=(1, 2))
-    matrices = np.tile(np.eye(4), (len(source), 1, 1))
-    matrices[:, :3, :3] = scale[:, None, None] * (u * sign[:, None]) @ vt
-    matrices[:, :3, 3] = mean_t[:, 0] - np.einsum("sij,sj->si", matrices[:, :3, :3], mean_s[:, 0])
-    return matrices
-
-
-def _off(source: np.ndarray, target: np.ndarray, solved: tuple[float, np.ndarray, np.ndarray]) -> np.ndarray:
-    scale, rotation, translation = solved
-    return np.asarray(np.linalg.norm(scale * source @ rotation.T + translation - target, axis=1))
 
 
 def _upright(path: np.ndarray, up: np.ndarray) -> np.ndarray:

@@ -101,9 +101,7 @@ class Trajectory:
         if self.in_order:
             place = np.interp(times[main], times[anchors], np.arange(len(anchors)))
         else:
-            centers = poses[anchors, :3, 3]
-            nearest = [np.argmin(np.linalg.norm(centers - center, axis=1)) for center in poses[main, :3, 3]]
-            place = np.array(nearest, np.float64)
+            place = nearest(poses[main, :3, 3], poses[anchors, :3, 3]).astype(np.float64)
         before = np.floor(place).astype(int)
         after = np.minimum(before + 1, len(anchors) - 1)
         change = geometry.se3_log(geometry.inverse(moves[before]) @ moves[after])
@@ -117,6 +115,13 @@ def along(timestamps: np.ndarray) -> np.ndarray:
     """(N,) ascending, what lies between frames: their times (N,), or where these stand still or go back, as of a clock
     that was set, their numbers."""
     return timestamps if (np.diff(timestamps) > 0.0).all() else np.arange(len(timestamps), dtype=np.float64)
+
+
+def nearest(centers: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """(N,) int which of the camera positions `among` (K, 3), at least one, is nearest to each of `centers` (N, 3).
+
+    Of photographs in any order it is what lies beside a pose, as `along` has it of a path's; any for a NaN."""
+    return np.array([np.argmin(np.linalg.norm(among - center, axis=1)) for center in centers], np.int64)
 
 
 def velocities(timestamps: np.ndarray, world_from_cam: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -136,4 +141,4 @@ def velocities(timestamps: np.ndarray, world_from_cam: np.ndarray, known: np.nda
     return result
 
 
-__all__ = ["LONGEST_GAP", "TrackingState", "Trajectory", "along", "velocities"]
+__all__ = ["LONGEST_GAP", "TrackingState", "Trajectory", "along", "nearest", "velocities"]

@@ -93,6 +93,27 @@ def test_frames_are_rendered_at_the_trackers_exposure_and_vignetting(evaluator: 
     assert "Exposure by frame" in (tmp_path / "report.html").read_text()
 
 
+def test_a_photograph_in_any_order_has_the_exposure_of_the_nearest_one(evaluator: Evaluator) -> None:
+    poses, index, none = poses_along(), np.arange(N), np.zeros(N, np.int32)
+    poses[:, :3, 3] += ORIGIN
+    poses[4] = poses[0]
+    gains = np.ones(N)
+    gains[[3, 5]] = 0.5, 0.7
+    exposure = (gains[:, None, None] * np.eye(3, 4)).astype(np.float32)
+    exposure[4] = np.nan
+    track = Trajectory(
+        index, index / 30, poses, index % 3 == 0, none.astype(np.uint8), none, exposure=exposure, in_order=False
+    )
+    list(evaluator.on_trajectory(track))
+    splat_map = splat_map_of(True)
+    splat_map.exposures[1, :, :3] *= 0.5  # of frame 3
+    list(evaluator.on_splat_map(splat_map))
+    found = evaluator.evaluation.scored_frames()[4].exposure
+    assert found is not None
+    np.testing.assert_allclose(found, np.eye(3, 4), atol=1e-6)
+    evaluator.evaluation.close()
+
+
 def test_without_exposures_the_report_speaks_of_none(evaluator: Evaluator, tmp_path: Path) -> None:
     report = feed(evaluator)
     assert report["exposure"] is None

@@ -89,8 +89,8 @@ def test_the_map_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.Monkey
     assert set(track.segment.tolist()) == {0}
     true = np.array([items[i].world_from_cam[:3, 3] for i in shown])
     found = track.world_from_cam[:, :3, 3]
-    scale, rotation, translation = umeyama(found, true)
-    errors = np.linalg.norm(scale * found @ rotation.T + translation - true, axis=1)
+    aligned = umeyama(found, true).apply(found)
+    errors = np.linalg.norm(aligned - true, axis=1)
     path = np.linalg.norm(np.diff(true[:50], axis=0), axis=1).sum()
     assert np.median(errors[:50]) < 0.005 * path
     assert np.median(errors[50:]) < 1.5 * np.median(errors[:50]) + 0.001 * path

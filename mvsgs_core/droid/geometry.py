@@ -72,12 +72,6 @@ def frame_distance(relative: Tensor, inverse_depth: Tensor, intrinsics: Tensor, 
     return torch.where(far, torch.full_like(total, 1000.0), total / weight.clamp(min=1e-9))
 
 
-def world_points(world_from_cam: Tensor, inverse_depth: Tensor, intrinsics: Tensor) -> Tensor:
-    """(K, h, w, 3) points of K maps in the world."""
-    points = _rays(inverse_depth.shape[-2], inverse_depth.shape[-1], intrinsics) / inverse_depth[..., None]
-    return torch.einsum("kab,khwb->khwa", world_from_cam[:, :3, :3], points) + world_from_cam[:, None, None, :3, 3]
-
-
 def agreeing_neighbors(
     relative: Tensor, inverse_depth: Tensor, others: Tensor, intrinsics: Tensor, tolerance: float
 ) -> Tensor:
@@ -100,4 +94,4 @@ def agreeing_neighbors(
     return (inside & agrees).sum(dim=0)
 
 
-__all__ = ["agreeing_neighbors", "cells", "frame_distance", "reproject", "world_points"]
+__all__ = ["agreeing_neighbors", "cells", "frame_distance", "reproject"]

@@ -85,8 +85,7 @@ def between(a: VideoFrame, b: VideoFrame, timestamp: float) -> np.ndarray:
     if a is b:
         return a.cam_from_world.copy()
     fraction = (timestamp - a.timestamp) / max(b.timestamp - a.timestamp, 1e-9)
-    twist = geometry.se3_log(b.cam_from_world @ geometry.inverse(a.cam_from_world))
-    return np.asarray(geometry.se3_exp(fraction * twist) @ a.cam_from_world)
+    return geometry.interpolate(a.cam_from_world, b.cam_from_world, fraction)
 
 
 __all__ = ["StoredFrame", "between", "fill"]

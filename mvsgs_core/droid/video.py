@@ -101,8 +101,7 @@ class Video:
         factor = float(np.mean([frame.inverse_depth.mean() for frame in self.frames]))
         for frame in self.frames:
             frame.inverse_depth = frame.inverse_depth / factor
-            frame.cam_from_world = frame.cam_from_world.copy()
-            frame.cam_from_world[:3, 3] *= factor
+            frame.cam_from_world = geometry.scaled(frame.cam_from_world, factor)
         return factor
 
     def around(self, indices: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:

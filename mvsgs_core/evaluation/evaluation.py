@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from mvsgs_core import geometry
 from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.evaluation import metrics, scoring, trajectory_metrics
 from mvsgs_core.evaluation.depth_metrics import NO_DEPTH, depth_ratios, score_depth
-from mvsgs_core.evaluation.exposure import FrameExposures, frame_exposures, summary
+from mvsgs_core.evaluation.exposure import frame_exposures, summary
 from mvsgs_core.evaluation.fitted_camera import fit_camera
 from mvsgs_core.evaluation.frames import Frames, Photograph
 from mvsgs_core.evaluation.many_frames import each
@@ -162,7 +163,7 @@ class Evaluation:
                     photograph.image,
                     near,
                     tracked.readout_time * moving[k] if rolling else None,
-                    None if exposures is None else exposures.affines[k],
+                    None if exposures is None else exposures[k],
                     finished.vignetting,
                     finished.antialiased,
                     finished.background,
@@ -172,14 +173,15 @@ class Evaluation:
             )
         return frames
 
-    def exposures(self, refined: bool) -> FrameExposures | None:
-        """Of all frames of the track; of those outside of the part that the map shows they mean nothing."""
+    def exposures(self, refined: bool) -> np.ndarray | None:
+        """(N, 3, 4) of all frames of the track; of those outside of the part that the map shows they mean nothing."""
         finished = self.maps[refined]
         tracked = self.trajectory or _of_keyframes(finished)
         main, place = tracked.main(finished.keyframes), _places(finished)
         mapped = np.flatnonzero(main & np.isin(tracked.index, finished.keyframes))
         affines = finished.exposures[[place[int(i)] for i in tracked.index[mapped]]]
-        return frame_exposures(tracked.timestamp, tracked.exposure, mapped, affines)
+        centers = None if tracked.in_order else np.where(main[:, None], tracked.world_from_cam[:, :3, 3], np.nan)
+        return frame_exposures(tracked.timestamp, tracked.exposure, mapped, affines, centers)
 
     def photograph(self, index: int) -> np.ndarray:
         """(H, W, 3) uint8, as renders are compared with it. Raises KeyError for a frame that was not kept."""
@@ -273,7 +275,7 @@ class Evaluation:
             self.scored()
         return scores
 
-    def _score_trajectory(self, notes: list[str]) -> tuple[trajectory_metrics.Alignment | None, dict[str, Any]]:
+    def _score_trajectory(self, notes: list[str]) -> tuple[geometry.Similarity | None, dict[str, Any]]:
         trajectory = self.final_trajectory or Trajectory.empty()
         notes += self._about_trajectory()
         poses = known_poses(trajectory, self._truth, self.keyframes)
@@ -326,7 +328,7 @@ class Evaluation:
         alignment, _ = self._score_trajectory([])
         return trajectory_metrics.aligned_path(trajectory, self._truth, alignment, self.keyframes)
 
-    def _score_depths(self, alignment: trajectory_metrics.Alignment | None, notes: list[str]) -> dict[str, Any]:
+    def _score_depths(self, alignment: geometry.Similarity | None, notes: list[str]) -> dict[str, Any]:
         """After one scale for the whole run, the median ratio of true to estimated depth, as is usual for monocular
         depth; `scale_ratio` is that over the trajectory's scale, 1 where poses and depth maps of the truth agree."""
         finished = self.finished

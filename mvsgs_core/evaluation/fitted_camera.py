@@ -104,7 +104,10 @@ def linearized(seen: Rendered, target: np.ndarray, frame: ScoredFrame) -> Linear
     known = np.isfinite(depth) & (depth > 0)
     length = float(np.median(depth[known])) if known.any() else 1.0
     u, v = (taken(axis[..., None])[0] for axis in camera.pixel_grid(*seen.depth.shape))
-    of_u, of_v = _pixel_motion(u, v, np.where(known, depth, np.inf), frame.intrinsics, length)
+    fx, fy, cx, cy = frame.intrinsics
+    seen_at = (u - cx) / fx, (v - cy) / fy, length / np.where(known, depth, np.inf)
+    x, y, near = (values.astype(np.float32) for values in seen_at)
+    of_u, of_v = camera.pixel_motion(x, y, near, frame.intrinsics)  # by a twist whose translation is in `length`
     of_u[:, ~known] = of_v[:, ~known] = 0.0
     factor = np.ones_like(seen.depth)[..., None]
     if frame.vignetting is not None:  # of the camera: it comes after the affine and does not move with the scene
@@ -126,21 +129,8 @@ def linearized(seen: Rendered, target: np.ndarray, frame: ScoredFrame) -> Linear
     return Linear(hessian + FLOOR * len(depth) * np.eye(count), gradient, squares, length)
 
 
-def _pixel_motion(
-    u: np.ndarray, v: np.ndarray, depth: np.ndarray, intrinsics: np.ndarray, length: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """(6, N) float32 of each axis: how pixels (u, v) of points at a depth, all (N,), move with the twist of the camera,
-    its translation in `length`; the interaction matrix of visual servoing (Chaumette and Hutchinson 2006)."""
-    fx, fy, cx, cy = intrinsics
-    x, y, near = (a.astype(np.float32) for a in ((u - cx) / fx, (v - cy) / fy, length / depth))
-    zero = np.zeros_like(x)
-    of_u = np.stack([-near, zero, x * near, x * y, -(1.0 + x * x), y])
-    of_v = np.stack([zero, -near, y * near, 1.0 + y * y, -x * y, -x])
-    return of_u * np.float32(fx), of_v * np.float32(fy)
-
-
 def _moved(frame: ScoredFrame, step: np.ndarray, length: float) -> ScoredFrame:
-    twist = step[:MOTION] * np.repeat([length, 1.0], 3)
+    twist = geometry.twist_scaled(step[:MOTION], length)
     change = np.eye(4)
     change[:3] += step[MOTION:].reshape(3, 4)
     exposure = np.eye(4)

@@ -127,6 +127,20 @@ def at(path: str) -> Metric:
     raise KeyError(f"no metric at {path!r} of the report; there are: {', '.join(METRICS)}")
 
 
+def value(report: Mapping[str, Any], place: str) -> Any:
+    """What a report has at a place such as "rendering.held_out"; None where it has nothing."""
+    found: Any = report
+    for key in place.split("."):
+        found = found.get(key) if isinstance(found, Mapping) else None
+    return found
+
+
+def number(report: Mapping[str, Any], place: str) -> float | None:
+    """The figure at a place such as "rendering.held_out.psnr"; None where there is none."""
+    found = value(report, place)
+    return float(found) if isinstance(found, int | float) and not isinstance(found, bool) else None
+
+
 def of_all(metrics: tuple[Metric, ...], measured: Any) -> dict[str, float | None]:
     """The value of each metric, by key; None for all where nothing was `measured`."""
     return {m.key: None if measured is None or m.of is None else m.of(measured) for m in metrics}
@@ -138,4 +152,7 @@ def listed(metrics: tuple[Metric, ...], values: Mapping[str, Any]) -> str:
     return ", ".join(f"{metric.label} {metric.text(value)}" for metric, value in known)
 
 
-__all__ = ["COUNTS", "DEPTH", "IMAGE", "METRICS", "RUN", "TRAJECTORY", "Figure", "Metric", "at", "listed", "of_all"]
+__all__ = [
+    "COUNTS", "DEPTH", "IMAGE", "METRICS", "RUN", "TRAJECTORY", "Figure", "Metric", "at", "listed", "number", "of_all",
+    "value",
+]  # fmt: skip

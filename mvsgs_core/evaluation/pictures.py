@@ -147,6 +147,6 @@ def _exposure_plot(evaluation: Evaluation) -> dict[str, str]:
     if found is None or tracked is None:
         return {}
     main = tracked.main(evaluation.maps[refined].keyframes)
-    x, y = tracked.index[main].astype(float), gains(found.affines)[main]
+    x, y = tracked.index[main].astype(float), gains(found)[main]
     series = [svg.Series(name, x, y[:, k]) for k, name in enumerate(("red", "green", "blue"))]
     return {"Exposure by frame": _plot(series, "frame", "gain against the mean camera")}

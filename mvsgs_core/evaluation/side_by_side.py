@@ -19,7 +19,7 @@ from mvsgs_core.export.cameras import Cameras, read_cameras
 from mvsgs_core.export.keyframe_render import rendered_keyframe
 from mvsgs_core.export.ply import read_ply
 from mvsgs_core.export.snapshot import Snapshot
-from mvsgs_core.mapping.preview import as_bytes
+from mvsgs_core.rasterizer.interface import as_bytes
 
 SHOWN = 3  # keyframes that all runs have, besides that in which they differ most
 _WIDTH = 640  # pixels of a picture at most

@@ -16,20 +16,7 @@ from mvsgs_core.trajectory import TrackingState, Trajectory
 ALIGNED = 3  # poses at least, for an alignment
 
 
-@dataclass(frozen=True)
-class Alignment:
-    """truth = scale * rotation @ estimate + translation."""
-
-    scale: float
-    rotation: np.ndarray  # (3, 3)
-    translation: np.ndarray  # (3,)
-
-    def positions(self, world_from_cam: np.ndarray) -> np.ndarray:
-        """Camera positions (N, 3) of estimated poses (N, 4, 4) in the frame of the truth."""
-        return self.scale * world_from_cam[:, :3, 3] @ self.rotation.T + self.translation
-
-
-def align(estimate: np.ndarray, truth: np.ndarray) -> Alignment:
+def align(estimate: np.ndarray, truth: np.ndarray) -> geometry.Similarity:
     """Least-squares Sim(3) from estimated to true camera positions; both (N, 4, 4) world_from_cam.
 
     Raises ValueError where no alignment exists: fewer than 3 poses, or positions that coincide.
@@ -38,12 +25,12 @@ def align(estimate: np.ndarray, truth: np.ndarray) -> Alignment:
         if len(poses) >= ALIGNED and not geometry.moves(poses[:, :3, 3]):
             raise ValueError(f"the {which} poses do not move: their positions coincide")
     # the truth's own origin may be far away: solved around its mean inside umeyama, in float64
-    return Alignment(*geometry.umeyama(estimate[:, :3, 3], truth[:, :3, 3]))
+    return geometry.umeyama(estimate[:, :3, 3], truth[:, :3, 3])
 
 
-def absolute_errors(estimate: np.ndarray, truth: np.ndarray, alignment: Alignment) -> np.ndarray:
+def absolute_errors(estimate: np.ndarray, truth: np.ndarray, alignment: geometry.Similarity) -> np.ndarray:
     """(N,) distances of aligned to true camera positions, in the unit of the truth."""
-    return np.linalg.norm(alignment.positions(estimate) - truth[:, :3, 3], axis=1)
+    return np.linalg.norm(alignment.apply(estimate[:, :3, 3]) - truth[:, :3, 3], axis=1)
 
 
 def rmse(errors: np.ndarray) -> float:
@@ -54,8 +41,7 @@ def relative_errors(estimate: np.ndarray, truth: np.ndarray, scale: float, step:
     """Relative pose error over `step` poses: RMSE of translation (truth's unit) and of rotation (degrees)."""
     if len(estimate) <= step:
         raise ValueError(f"relative errors over {step} poses need more than {step} poses")
-    scaled = estimate.copy()
-    scaled[:, :3, 3] *= scale
+    scaled = geometry.scaled(estimate, scale)
     move_e = geometry.inverse(scaled[:-step]) @ scaled[step:]
     move_t = geometry.inverse(truth[:-step]) @ truth[step:]
     error = geometry.inverse(move_t) @ move_e
@@ -83,7 +69,7 @@ class KnownPoses:
         return int(self.keyframe.sum()) >= ALIGNED
 
     @cached_property
-    def alignment(self) -> Alignment:
+    def alignment(self) -> geometry.Similarity:
         """Raises ValueError where there is none, as `align` does; so do `errors` and `relative`."""
         aligned = self.keyframe if self.by_keyframes else slice(None)
         return align(self.estimate[aligned], self.truth[aligned])
@@ -139,7 +125,7 @@ class AlignedPath:
 
 
 def aligned_path(
-    trajectory: Trajectory, truth: Mapping[int, np.ndarray], alignment: Alignment | None,
+    trajectory: Trajectory, truth: Mapping[int, np.ndarray], alignment: geometry.Similarity | None,
     keyframes: np.ndarray | Sequence[int] = (),
 ) -> AlignedPath:  # fmt: skip
     """Of the part with the map's `keyframes`, by index; truth: poses (4, 4) by frame index."""
@@ -151,7 +137,7 @@ def aligned_path(
     known = np.isin(index, list(truth))
     true = poses_of(truth, index[known])
     return AlignedPath(
-        index, alignment.positions(poses), alignment.rotation @ poses[:, :3, :3], true[:, :3, 3], index[known],
+        index, alignment.apply(poses[:, :3, 3]), alignment.rotation @ poses[:, :3, :3], true[:, :3, 3], index[known],
         absolute_errors(poses[known], true, alignment), "unit of the true poses",
     )  # fmt: skip
 

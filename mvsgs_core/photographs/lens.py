@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mvsgs_core.camera import straightened
+
 
 @dataclass(frozen=True)
 class SharedLens:
@@ -28,14 +30,8 @@ class SharedLens:
     def unproject(self, photograph: np.ndarray, pixels: np.ndarray) -> np.ndarray:
         """Undistorted points (N, 2) on the plane at distance 1, of pixels (N, 2)."""
         fx, fy, cx, cy = self.intrinsics[photograph].T
-        seen = np.stack([(pixels[:, 0] - cx) / (self.factor * fx), (pixels[:, 1] - cy) / (self.factor * fy)], axis=-1)
-        if self.k1 == 0.0 and self.k2 == 0.0:
-            return seen
-        straight = seen.copy()
-        for _ in range(10):
-            r2 = np.sum(straight**2, axis=1, keepdims=True)
-            straight = seen / np.maximum(1.0 + r2 * (self.k1 + r2 * self.k2), 0.1)
-        return straight
+        x, y = (pixels[:, 0] - cx) / (self.factor * fx), (pixels[:, 1] - cy) / (self.factor * fy)
+        return np.stack(straightened(x, y, self.k1, self.k2), axis=-1)
 
     def focal(self, photograph: int) -> float:
         """Pixels, the mean of both axes."""

@@ -10,7 +10,7 @@ compared with those that it was matched with, and changes nothing.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,9 +18,9 @@ from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.photographs.features import Features
 from mvsgs_core.photographs.two_views import TwoViews
 from mvsgs_core.stats import Stats
-from mvsgs_core.tracking.estimation.gray_levels import TERMS, Levels, Samples, backward, log_ratio_moments
-from mvsgs_core.tracking.estimation.photometry import PhotometricCalibration, PhotometricEdges, solve_photometry
-from mvsgs_core.tracking.estimation.response import radial_terms, vignetting_polynomial
+from mvsgs_core.tracking.estimation.gray_levels import Levels, Samples, log_ratio_moments
+from mvsgs_core.tracking.estimation.lights import ImageLights, edges_between
+from mvsgs_core.tracking.estimation.response import radial_terms
 from mvsgs_core.tracking.image import CELL, TrackingImage, tracking_size
 
 
@@ -65,32 +65,16 @@ class Look:
         return self.levels.at(points), radial_terms(points, self.intrinsics, self.size)
 
 
-@dataclass
-class Light:
+class Light(ImageLights):
     """Of all photographs, once `solve` was called."""
 
-    stats: Stats
-    looks: list[Look] = field(default_factory=list)
-    _calibration: PhotometricCalibration = field(default_factory=lambda: PhotometricCalibration.steady(0))
-    _lights: dict[int, np.ndarray] = field(default_factory=dict)  # (5,) by photograph
-
-    @property
-    def vignetting(self) -> np.ndarray | None:
-        """(3,) float32, see `msgs`; None: there is none."""
-        found = self._calibration
-        if not np.any(found.vignetting):
-            return None
-        return vignetting_polynomial(found.vignetting, found.vignetting_response).astype(np.float32)
-
-    def exposure(self, photograph: int) -> np.ndarray | None:
-        """(3, 4) float32 color affine; None where exposures do not vary, or nothing tells this one's."""
-        if not self._calibration.varies or photograph not in self._lights:
-            return None
-        return self._calibration.affine(self._lights[photograph])
+    def __init__(self, stats: Stats) -> None:
+        super().__init__(stats)
+        self.looks: list[Look] = []  # of each photograph
 
     def exposures(self) -> np.ndarray | None:
         """(P, 3, 4) float32 of all, NaN where it is not known; None where exposures do not vary."""
-        if not self._calibration.varies:
+        if not self.varies:
             return None
         none = np.full((3, 4), np.nan, np.float32)
         found = [self.exposure(n) for n in range(len(self.looks))]
@@ -106,10 +90,15 @@ class Light:
                 found = self._compared(self.looks[i], self.looks[j], features[i], features[j], views.matches)
                 if found is not None:
                     moments[i, j] = found
-        self._solve(moments, np.flatnonzero(mapped & posed))
-        if self._calibration.varies:
+        members = np.flatnonzero(mapped & posed).tolist()
+        exposures = (self.looks[index].exposure for index in members)
+        lights = self._solved(members, edges_between(members, moments), exposures)
+        if lights is None:
+            return
+        self._lights = lights
+        if self.varies:
             for index in np.flatnonzero(posed & ~mapped).tolist():
-                self._attach(index, moments)
+                self._attach(index, moments.items())
 
     def _compared(self, a: Look, b: Look, of_a: Features, of_b: Features, matches: np.ndarray) -> np.ndarray | None:
         chosen, off = a.beside(of_a.points[matches[:, 0]])
@@ -120,38 +109,6 @@ class Light:
         off_b = np.stack([cos * off[:, 0] - sin * off[:, 1], sin * off[:, 0] + cos * off[:, 1]], axis=1)
         (levels_a, at_a), (levels_b, at_b) = a.at(of_a.points[here] + off), b.at(of_b.points[there] + off_b)
         return log_ratio_moments(levels_a, levels_b, (at_a, at_b), np.zeros(3))
-
-    def _solve(self, moments: Mapping[tuple[int, int], np.ndarray], members: np.ndarray) -> None:
-        number = {int(index): n for n, index in enumerate(members)}
-        inner = {pair: found for pair, found in moments.items() if pair[0] in number and pair[1] in number}
-        edges = PhotometricEdges(
-            np.array([number[i] for i, _ in inner], np.int64),
-            np.array([number[j] for _, j in inner], np.int64),
-            np.array(list(inner.values())).reshape(-1, 3, TERMS, TERMS),
-        )
-        exposures = np.array([self.looks[int(index)].exposure for index in members])
-        known = np.where(exposures > 0.0, np.log(np.maximum(exposures, 1e-300)), np.nan)
-        try:
-            self._calibration = solve_photometry(edges, len(members), known)
-        except (np.linalg.LinAlgError, ValueError) as error:
-            self.stats.warn(f"exposures could not be solved for: {error}")
-            return
-        if self._calibration.warning:
-            self.stats.warn(self._calibration.warning)
-        self._lights = {int(index): light for index, light in zip(members, self._calibration.lights)}
-
-    def _attach(self, index: int, moments: Mapping[tuple[int, int], np.ndarray]) -> None:
-        """The light of a held-out photograph, from those of the map that it was matched with."""
-        found: list[tuple[float, np.ndarray]] = []
-        for (i, j), between in moments.items():
-            other = i if j == index else j
-            if index in (i, j) and other in self._lights:
-                there = between if j == index else backward(between)
-                information = 1.0 / (self._calibration.edge_sigma[0] ** 2 + 1.0 / there[:, 0, 0].mean())
-                found.append((float(information), self._lights[other] + self._calibration.step(there)))
-        if found:
-            weights, lights = zip(*found)
-            self._lights[index] = np.asarray(np.average(lights, axis=0, weights=weights))
 
 
 __all__ = ["Light", "Look"]

@@ -7,52 +7,24 @@ from it (PnP), adds points, and bundle adjustment mends what is around it, or ev
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mvsgs_core import geometry
-from mvsgs_core.photographs.adjustment import SparseProblem, adjust_sparse, reprojection
 from mvsgs_core.photographs.lens import SharedLens
-from mvsgs_core.photographs.registration import BENT, MAX_ERROR, MIN_SEEN, ROBUST, register
+from mvsgs_core.photographs.registration import BENT, MAX_ERROR, MIN_SEEN, register
+from mvsgs_core.photographs.sparse_map import MIN_ANGLE, Model, SparseMap
 from mvsgs_core.photographs.tracks import Tracks
-from mvsgs_core.photographs.triangulation import triangulate
 from mvsgs_core.photographs.two_views import TwoViews, relative_poses
 
-MIN_ANGLE = np.radians(1.5)  # between the rays of a point
 FIRST_ANGLE = np.radians(5.0)  # of the first two views, median
 FIRST_PAIRS, FIRST_TRIES = 12, 3  # pairs that are looked at, at least, and that may begin a map
 PLANE = 0.8  # of the matches: where one homography explains so many, they may lie on a plane
 MIN_PHOTOGRAPHS = 3  # of a model
 AGAIN = 1.2  # times as many points of the map must a photograph see to be tried again
 GROWTH = 1.2  # of the number of photographs, between two adjustments of everything
-AROUND = 6  # photographs that a local adjustment moves
-SETTLED = 1e-3  # of the observations: where fewer came or went, adjusting everything once more changes nothing
-ROUGH = 1e-3  # of the cost: a smaller gain ends an adjustment while the map still grows
-FOR_FOCAL, FOR_DISTORTION = 3, 5  # photographs, from which on these are estimated
 FOR_OTHERS = 10  # photographs of a model whose lens holds for what is put together after it
 SAME_CAMERA = 1.05  # between focal lengths that were given for one camera
 GRIDS = (2, 4, 8, 16)  # boxes along a side, over which a photograph's points are spread
-
-
-@dataclass(frozen=True)
-class Model:
-    """A part of the photographs, in one frame and unit of its own."""
-
-    cam_from_world: np.ndarray  # (P, 4, 4), NaN of those that are not in it
-    lens: SharedLens
-    points: np.ndarray  # (M, 3)
-    tracks: np.ndarray  # (M,) of which each point is
-    photograph: np.ndarray  # (N,) of each observation
-    point: np.ndarray  # (N,)
-    pixels: np.ndarray  # (N, 2)
-    residual: np.ndarray  # (N,) pixels
-    order: list[int]  # photographs as they were registered
-
-    @property
-    def registered(self) -> np.ndarray:
-        """(P,) bool."""
-        return np.asarray(np.isfinite(self.cam_from_world).all(axis=(1, 2)))
 
 
 class Reconstruction:
@@ -66,11 +38,8 @@ class Reconstruction:
         free_lens: bool,
     ) -> None:
         """sizes: (P, 2) height and width. free_lens: focal length and distortion are estimated too."""
-        self.tracks, self.lens, self.sizes, self.free_lens = tracks, lens, sizes, free_lens
-        self._given = lens
-        self.poses = np.full((len(sizes), 4, 4), np.nan)
-        self.points = np.full((tracks.count, 3), np.nan)
-        self.order: list[int] = []
+        self.tracks, self.lens, self.sizes = tracks, lens, sizes
+        self.map = SparseMap(tracks, lens, len(sizes), free_lens)
         self._adjusted = 0  # photographs when everything was adjusted last
         self._failed: dict[int, int] = {}  # photograph -> points of the map that it saw when it got no pose
         self._box = [self._boxes(n) for n in GRIDS]
@@ -85,9 +54,9 @@ class Reconstruction:
             for pose in poses:
                 if self._begin(pair, pose):
                     self._grow(left)
-                    self._triangulate(None)
+                    self.map.triangulate()
                     self._adjust_all(last=True)
-                    grown.append(self._model())
+                    grown.append(self.map.model())
             best = max(grown, key=lambda model: (len(model.order), len(model.residual)), default=None)
             if best is not None and len(best.order) >= MIN_PHOTOGRAPHS:
                 return best
@@ -95,27 +64,27 @@ class Reconstruction:
 
     def _grow(self, left: np.ndarray) -> None:
         settled, bent = 0, False  # photographs when those that failed were last tried again, and how
-        while len(self.order) >= 2:
+        while len(self.map.order) >= 2:
             chosen = self._next(left)
             if chosen is None:
                 if not self._failed:
                     return
-                if len(self.order) > self._adjusted:
+                if len(self.map.order) > self._adjusted:
                     self._adjust_all()  # which may take poses back: what came and went again is no gain
-                gained = len(self.order) > settled
+                gained = len(self.map.order) > settled
                 if bent and not gained:
                     return
                 bent = not gained  # the mended map has brought no more: it may be bent there
-                settled = max(settled, len(self.order))
+                settled = max(settled, len(self.map.order))
                 self._failed.clear()  # once more
                 continue
             index, seen = chosen
             if not self._register(index, BENT * MAX_ERROR if bent else MAX_ERROR):
                 self._failed[index] = seen
                 continue
-            self._triangulate(index)
-            self._adjust_around(index)
-            if len(self.order) >= GROWTH * self._adjusted:
+            self.map.triangulate(index)
+            self.map.adjust_around(index)
+            if len(self.map.order) >= GROWTH * self._adjusted:
                 self._adjust_all()
 
     def _starts(
@@ -152,20 +121,18 @@ class Reconstruction:
 
     def _begin(self, pair: tuple[int, int], second_from_first: np.ndarray) -> bool:
         """A map of two views alone, in the place of whatever there was."""
-        self.lens, self.order, self._adjusted = self._given, list(pair), 0
-        self.poses[:], self.points[:] = np.nan, np.nan
-        self.poses[pair[0]], self.poses[pair[1]] = np.eye(4), second_from_first
+        self.map.begin(pair, second_from_first)
+        self._adjusted = 0
         self._failed.clear()
-        self._triangulate(None)
-        if self._known().sum() < MIN_SEEN:
+        if self.map.known.sum() < MIN_SEEN:
             return False
         self._adjust_all()
-        return len(self.order) == len(pair)
+        return len(self.map.order) == len(pair)
 
     def _next(self, left: np.ndarray) -> tuple[int, int] | None:
         """The photograph whose points of the map are best spread over it, and how many it sees."""
-        mapped = self._known()[self.tracks.track]
-        open_ = left & ~np.isfinite(self.poses[:, 0, 0])
+        mapped = self.map.known[self.tracks.track]
+        open_ = left & ~self.map.posed
         count = np.bincount(self.tracks.photograph[mapped], minlength=len(left))
         score = np.zeros(len(left))
         for side, box in zip(GRIDS, self._box):
@@ -183,147 +150,22 @@ class Reconstruction:
 
     def _register(self, index: int, max_error: float) -> bool:
         """PnP of one photograph against the map; whether it has a pose now."""
-        mine = np.flatnonzero((self.tracks.photograph == index) & self._known()[self.tracks.track])
-        world = self.points[self.tracks.track[mine]]
-        pose = register(index, world, self.tracks.pixels[mine], self.lens, max_error)
+        mine = np.flatnonzero((self.tracks.photograph == index) & self.map.known[self.tracks.track])
+        world = self.map.points[self.tracks.track[mine]]
+        pose = register(index, world, self.tracks.pixels[mine], self.map.lens, max_error)
         if pose is None:
             return False
-        self.poses[index] = pose
-        self.order.append(index)
+        self.map.add(index, pose)
         return True
 
-    def _triangulate(self, index: int | None) -> None:
-        """New points, of the tracks that photograph `index` sees, or of all."""
-        posed = np.isfinite(self.poses[:, 0, 0])
-        wanted = ~self._known()
-        if index is not None:
-            seen = np.zeros(self.tracks.count, bool)
-            seen[self.tracks.track[self.tracks.photograph == index]] = True
-            wanted &= seen
-        use = np.flatnonzero(wanted[self.tracks.track] & posed[self.tracks.photograph])
-        points, tracks = triangulate(
-            self.poses, self.lens, self.tracks.photograph[use], self.tracks.track[use], self.tracks.pixels[use],
-            MAX_ERROR, MIN_ANGLE,
-        )  # fmt: skip
-        self.points[tracks] = points
-
-    def _adjust_around(self, index: int) -> None:
-        """The photographs that share most points with `index` move, with the points that they see."""
-        use, _ = self._agreeing()
-        seen = np.zeros(self.tracks.count, bool)
-        seen[self.tracks.track[use[self.tracks.photograph[use] == index]]] = True
-        shared = np.bincount(self.tracks.photograph[use[seen[self.tracks.track[use]]]], minlength=len(self.poses))
-        near = [int(n) for n in np.argsort(-shared, kind="stable")[: AROUND + 1] if shared[n] > 0]
-        free = np.zeros(len(self.poses), bool)
-        free[near] = True
-        free[self.order[:2] if len(near) >= len(self.order) else self.order[:1]] = False  # frame of reference and unit
-        moved = np.zeros(self.tracks.count, bool)
-        moved[self.tracks.track[use[free[self.tracks.photograph[use]]]]] = True
-        self._solve(use[moved[self.tracks.track[use]]], free, steps=5, lens=False, tolerance=ROUGH)
-
     def _adjust_all(self, last: bool = False) -> None:
-        """Everything moves; observations that miss are left out and come back, tracks without a point try again."""
-        before = 0
-        for _ in range(2):
-            use, _ = self._agreeing()
-            if len(self.order) < 2 or abs(len(use) - before) < SETTLED * before:
-                break
-            before = len(use)
-            self._adjust(use, steps=10, tolerance=ROUGH)
-        if last and len(self.order) >= 2:
-            self._adjust(self._agreeing()[0], steps=25, tolerance=1e-5)
-        self._adjusted = len(self.order)
-
-    def _adjust(self, use: np.ndarray, steps: int, tolerance: float) -> None:
-        free = np.isfinite(self.poses[:, 0, 0])
-        free[self.order[0]] = False
-        self._solve(use, free, steps, lens=True, tolerance=tolerance)
-        self._normalize()
-        self._forget()
-        dropped = self._drop()
-        self._triangulate(None)
-        if dropped:  # only with more points than are there now are they tried again
-            seen = np.bincount(self.tracks.photograph[self._known()[self.tracks.track]], minlength=len(self.poses))
-            self._failed |= {index: int(seen[index]) for index in dropped}
-
-    def _solve(self, use: np.ndarray, free: np.ndarray, steps: int, lens: bool, tolerance: float) -> None:
-        views = len(self.order) if lens and self.free_lens else 0
-        problem = replace(
-            self._problem(use, free),
-            free_focal=views >= FOR_FOCAL,
-            free_distortion=views >= FOR_DISTORTION,
-            known_factor=self._given.factor,
-        )
-        solution = adjust_sparse(problem, steps, ROBUST, tolerance)
-        self.poses[free] = solution.cam_from_world[free]
-        self.points[np.unique(self.tracks.track[use])] = solution.points
-        self.lens = solution.lens
-
-    def _problem(self, use: np.ndarray, free: np.ndarray) -> SparseProblem:
-        names, point = np.unique(self.tracks.track[use], return_inverse=True)
-        poses = np.where(np.isfinite(self.poses), self.poses, np.eye(4))
-        return SparseProblem(
-            poses, self.points[names], self.lens, self.tracks.photograph[use], point, self.tracks.pixels[use], free
-        )
-
-    def _agreeing(self) -> tuple[np.ndarray, np.ndarray]:
-        """Observations of points of the map in posed photographs that hit them, and their errors in pixels."""
-        posed = np.isfinite(self.poses[:, 0, 0])
-        use = np.flatnonzero(self._known()[self.tracks.track] & posed[self.tracks.photograph])
-        residual, z = reprojection(self._problem(use, posed))
-        error = np.where(z > 1e-6, np.linalg.norm(residual, axis=1), np.inf)
-        good = error < MAX_ERROR
-        good &= (np.bincount(self.tracks.track[use], good, minlength=self.tracks.count) >= 2)[self.tracks.track[use]]
-        return use[good], error[good]
-
-    def _forget(self) -> None:
-        """Points that two observations no longer hit, or whose rays are too close to say how far they are."""
-        use, _ = self._agreeing()
-        track = self.tracks.track[use]
-        centers = geometry.inverse(np.where(np.isfinite(self.poses), self.poses, np.eye(4)))[:, :3, 3]
-        rays = self.points[track] - centers[self.tracks.photograph[use]]
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        total = np.stack([np.bincount(track, rays[:, n], minlength=self.tracks.count) for n in range(3)], axis=1)
-        count = np.bincount(track, minlength=self.tracks.count)
-        mean = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
-        off = np.zeros(self.tracks.count)  # largest angle of a ray from the mean: half of the widest pair, or more
-        np.maximum.at(off, track, np.arccos(np.clip(np.sum(rays * mean[track], axis=1), -1.0, 1.0)))
-        self.points[(count < 2) | (2.0 * off < MIN_ANGLE)] = np.nan
-
-    def _drop(self) -> list[int]:
-        """Photographs that too few points hold any more lose their poses; which."""
-        use, _ = self._agreeing()
-        held = np.bincount(self.tracks.photograph[use], minlength=len(self.poses))
-        dropped = [n for n in self.order if held[n] < MIN_SEEN]
-        self.poses[dropped] = np.nan
-        self.order = [n for n in self.order if n not in dropped]
-        return dropped
-
-    def _normalize(self) -> None:
-        """The unit is the cameras' spread: nothing runs away from the solver's thresholds."""
-        posed = np.isfinite(self.poses[:, 0, 0])
-        centers = geometry.inverse(self.poses[posed])[:, :3, 3]
-        scale = float(np.median(np.linalg.norm(centers - centers.mean(axis=0), axis=1)))
-        if scale > 0.0:
-            self.poses[:, :3, 3] /= scale
-            self.points /= scale
-
-    def _known(self) -> np.ndarray:
-        """(tracks,) bool: those with a point."""
-        return np.asarray(np.isfinite(self.points[:, 0]))
+        self._failed |= self.map.adjust_all(last)  # only with more points than are there now are they tried again
+        self._adjusted = len(self.map.order)
 
     def _boxes(self, side: int) -> np.ndarray:
         size = self.sizes[self.tracks.photograph]
         at = np.clip((self.tracks.pixels + 0.5) / size[:, ::-1] * side, 0, side - 1).astype(int)
         return np.asarray(at[:, 1] * side + at[:, 0])
-
-    def _model(self) -> Model:
-        use, error = self._agreeing()
-        names, point = np.unique(self.tracks.track[use], return_inverse=True)
-        return Model(
-            self.poses.copy(), self.lens, self.points[names], names, self.tracks.photograph[use], point,
-            self.tracks.pixels[use], error, list(self.order),
-        )  # fmt: skip
 
 
 def all_models(
@@ -370,4 +212,4 @@ def _one_camera(a: np.ndarray, b: np.ndarray) -> bool:
     return bool(np.median(b) < SAME_CAMERA * a.max() and np.median(b) > a.min() / SAME_CAMERA)
 
 
-__all__ = ["Model", "Reconstruction", "all_models", "connected"]
+__all__ = ["Reconstruction", "all_models", "connected"]

@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 
 from mvsgs_core.camera import scale_intrinsics
-from mvsgs_core.photographs.reconstruction import MIN_ANGLE, PLANE
+from mvsgs_core.photographs.reconstruction import PLANE
+from mvsgs_core.photographs.sparse_map import MIN_ANGLE
 from mvsgs_core.photographs.two_views import relative_poses
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.image import TrackingImage, tracking_size

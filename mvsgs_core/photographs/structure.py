@@ -14,8 +14,9 @@ from mvsgs_core.photographs.features import Features, find_features
 from mvsgs_core.photographs.focal import BY_HOMOGRAPHY, focal_factor
 from mvsgs_core.photographs.lens import SharedLens
 from mvsgs_core.photographs.matching import EXHAUSTIVE, match, near_pairs, propose_pairs
-from mvsgs_core.photographs.reconstruction import Model, all_models
+from mvsgs_core.photographs.reconstruction import all_models
 from mvsgs_core.photographs.registration import register
+from mvsgs_core.photographs.sparse_map import Model
 from mvsgs_core.photographs.tracks import Tracks, link
 from mvsgs_core.photographs.two_views import TwoViews, verify
 from mvsgs_core.stats import Stats

@@ -1,7 +1,6 @@
 """Photographs as a tracker: nothing is known before the last one; then all leave as keyframes, as the map saw them.
 
-Held-out photographs (held_out.py) get poses from the finished map and add nothing to it, where enough others are left
-to make it.
+Held-out photographs (held_out.py) get poses from the finished map and add nothing to it.
 """
 
 from __future__ import annotations
@@ -17,7 +16,8 @@ from mvsgs_core.held_out import is_held_out
 from mvsgs_core.photographs.config import PhotographsConfig
 from mvsgs_core.photographs.light import Light, Look
 from mvsgs_core.photographs.ordering import chain, covisibility
-from mvsgs_core.photographs.reconstruction import MIN_PHOTOGRAPHS, Model
+from mvsgs_core.photographs.reconstruction import MIN_PHOTOGRAPHS
+from mvsgs_core.photographs.sparse_map import Model
 from mvsgs_core.photographs.structure import Photographs
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.image import CELL, tracking_size
@@ -141,8 +141,6 @@ class PhotographTracker:
     def _solve(self) -> None:
         count = len(self._frames)
         self._held_out = np.array([is_held_out(index) for index, _ in self._frames], bool)
-        if count - self._held_out.sum() < MIN_PHOTOGRAPHS:  # they would make no map
-            self._held_out[:] = False
         mapped = ~self._held_out
         self._models = self.photographs.solve(mapped)
         posed = np.zeros(count, bool)

@@ -1,4 +1,4 @@
-"""Reprojection, frame distance, points and the depth filter against the authors' values (golden, its README)."""
+"""Reprojection, frame distance and the depth filter against the authors' values (golden, its README)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mvsgs_core import geometry
-from mvsgs_core.droid.geometry import agreeing_neighbors, frame_distance, reproject, world_points
+from mvsgs_core.droid.geometry import agreeing_neighbors, frame_distance, reproject
 from tests.support.golden import error, folder
 
 TOLERANCE = 1e-5
@@ -49,12 +49,6 @@ def test_frame_distance(named: tuple[str, Scene]) -> None:
     stored = scene.golden[f"{name}_frame_distance_beta0.3"]
     other = ~np.eye(k, dtype=bool)  # the diagonal is rounding noise
     assert error(found.numpy()[other], stored[other]) < TOLERANCE
-
-
-def test_world_points(named: tuple[str, Scene]) -> None:
-    name, scene = named
-    points = world_points(torch.linalg.inv(scene.poses), scene.inverse_depth, scene.intrinsics)
-    assert error(points, scene.golden[f"{name}_world_points"]) < TOLERANCE
 
 
 def test_depth_filter(named: tuple[str, Scene]) -> None:

@@ -48,8 +48,8 @@ def run(
 def errors(trajectory: Trajectory) -> tuple[np.ndarray, float]:
     """Distances from the true positions after Sim(3) alignment, and the scale found."""
     truth, found = oracle.path(COUNT)[trajectory.index][:, :3, 3], trajectory.world_from_cam[:, :3, 3]
-    scale, rotation, translation = geometry.umeyama(found, truth)
-    return np.linalg.norm(scale * found @ rotation.T + translation - truth, axis=1), scale
+    similarity = geometry.umeyama(found, truth)
+    return np.linalg.norm(similarity.apply(found) - truth, axis=1), similarity.scale
 
 
 @pytest.fixture(scope="module")

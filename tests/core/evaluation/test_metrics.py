@@ -21,7 +21,7 @@ def frame(index: int, gray: int) -> ScoredFrame:
 
 
 def test_a_render_that_equals_its_photograph_leaves_the_means_finite() -> None:
-    scores = [score_frame(empty_map(), "gaussian", frame(index, gray)) for index, gray in ((0, 0), (5, 51))]
+    scores = [score_frame(empty_map(), "gaussian", frame(index, gray)) for index, gray in ((5, 0), (10, 51))]
     found = summarize(scores)
     assert scores[0].figures["psnr"] == metrics.BEST_PSNR == 100.0
     assert found["held_out"]["psnr"] == pytest.approx((100.0 + 13.98) / 2, abs=0.01)
@@ -31,9 +31,9 @@ def test_a_render_that_equals_its_photograph_leaves_the_means_finite() -> None:
 def test_a_new_entry_is_scored_ranked_and_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     brightness = Metric("mae", "mean error", "%", 1, "lower", of=lambda a, b: float(np.abs(a - b).mean()), factor=100)
     monkeypatch.setattr(metrics, "IMAGE", (brightness, *metrics.IMAGE))
-    scores = [score_frame(empty_map(), "gaussian", frame(index, gray)) for index, gray in ((0, 51), (5, 102))]
+    scores = [score_frame(empty_map(), "gaussian", frame(index, gray)) for index, gray in ((5, 51), (10, 102))]
     assert [round(score.entry()["mae"], 3) for score in scores] == [0.2, 0.4]
-    assert worst_of(scores).index == 5
+    assert worst_of(scores).index == 10
     report = {"rendering": summarize(scores), "rendering_before_refinement": summarize([])}
     assert report["rendering"]["all"]["mae"] == pytest.approx(0.3)
     assert "<th>mean error %</th>" in html.rendering_table(report)
@@ -62,3 +62,11 @@ def test_texts_have_digits_unit_and_a_mark_for_nothing() -> None:
     assert metrics.at("rendering.all.psnr").text(None) == "–"
     assert metrics.listed(metrics.IMAGE, {"psnr": 31.2, "ssim": None}) == "PSNR 31.20 dB"
     assert metrics.of_all(metrics.DEPTH, NO_DEPTH) == metrics.of_all(metrics.DEPTH, None)
+
+
+def test_a_report_is_asked_by_place() -> None:
+    report = {"map": {"splats": 7, "kept": True}, "rendering": None}
+    assert metrics.value(report, "map") == report["map"]
+    assert metrics.number(report, "map.splats") == 7.0
+    for place in ("map.kept", "map.bytes", "map.splats.most", "rendering.held_out.psnr", "depth"):
+        assert metrics.number(report, place) is None

@@ -40,32 +40,33 @@ def test_a_stream_of_few_frames_is_scored_whole() -> None:
 
 def test_the_worst_of_all_stands_beside_the_worst_of_the_held_out() -> None:
     scores = [score(0, 33.0), score(1, 36.0, keyframe=True), score(4, 20.3, coverage=0.8), score(5, 31.0),
-              score(10, 25.0, keyframe=True, coverage=0.97)]  # fmt: skip
+              score(10, 25.0, keyframe=True, coverage=0.97), score(15, 33.0)]  # fmt: skip
     found = summarize(scores)
     assert found["held_out"] == {"psnr": 32.0, "ssim": 0.9, "lpips": None, "count": 2}
     assert found["keyframes"]["count"] == 2
-    assert found["all"]["count"] == 5
+    assert found["all"]["count"] == 6
     assert found["generalization_gap"] == pytest.approx((36.0 + 25.0) / 2 - 32.0)
     assert found["held_out_fitted"] == {"psnr": None, "ssim": None, "lpips": None, "count": 0}
     assert found["worst"]["held_out"]["index"] == 5
     worst = found["worst"]["all"]
     assert (worst["index"], worst["psnr"], worst["keyframe"], worst["held_out"]) == (4, 20.3, False, False)
-    assert found["coverage"] == {"mean": pytest.approx(0.954), "min": 0.8, "min_index": 4, "count": 5}
-    assert [frame["index"] for frame in found["frames"]] == [0, 1, 4, 5, 10]
-    assert [frame["held_out"] for frame in found["frames"]] == [True, False, False, True, False]  # 10 became a keyframe
+    assert found["coverage"] == {"mean": pytest.approx(5.77 / 6), "min": 0.8, "min_index": 4, "count": 6}
+    assert [frame["index"] for frame in found["frames"]] == [0, 1, 4, 5, 10, 15]
+    held_out = [frame["index"] for frame in found["frames"] if frame["held_out"]]
+    assert held_out == [5, 15], "0 is the first frame, 10 became a keyframe"
     assert set(found["frames"][0]) == {"index", "keyframe", "held_out", "psnr", "ssim", "lpips", "coverage", "kind",
                                        "fitted"}  # fmt: skip
-    assert [frame["kind"] for frame in found["frames"]][-3:] == ["between keyframes", "held out", "keyframe"]
+    assert [frame["kind"] for frame in found["frames"]][2:5] == ["between keyframes", "held out", "keyframe"]
 
 
 def test_the_protocol_that_fits_cameras_stands_beside_the_strict_one() -> None:
     fitted = Score(
-        0, False, {"psnr": 30.0, "ssim": 0.9, "lpips": None}, 1.0, {"psnr": 34.0, "ssim": 0.94, "lpips": None}
+        5, False, {"psnr": 30.0, "ssim": 0.9, "lpips": None}, 1.0, {"psnr": 34.0, "ssim": 0.94, "lpips": None}
     )
-    found = summarize([fitted, score(3, 31.0, keyframe=True), score(5, 20.0)])
+    found = summarize([fitted, score(6, 31.0, keyframe=True), score(10, 20.0)])
     assert found["held_out"] == {"psnr": 25.0, "ssim": 0.9, "lpips": None, "count": 2}
     assert found["held_out_fitted"] == {"psnr": 34.0, "ssim": 0.94, "lpips": None, "count": 1}
-    assert found["worst"]["held_out"]["index"] == 5
+    assert found["worst"]["held_out"]["index"] == 10
     assert found["frames"][0]["psnr"] == 30.0
     assert found["frames"][0]["fitted"]["psnr"] == 34.0
     assert found["frames"][2]["fitted"] is None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
@@ -9,6 +11,7 @@ from mvsgs_core.photographs.features import Features
 from mvsgs_core.photographs.light import Light, Look
 from mvsgs_core.photographs.two_views import TwoViews
 from mvsgs_core.stats import Stats
+from mvsgs_core.tracking.estimation.photometry import PhotometricCalibration
 
 COUNT = 6
 INTRINSICS = np.array([300.0, 300.0, 159.5, 119.5])
@@ -57,3 +60,18 @@ def test_a_held_out_photograph_changes_nothing() -> None:
 
 def test_a_steady_camera_has_no_exposures() -> None:
     assert solved(np.ones((COUNT, 3))).exposures() is None
+
+
+def test_exposures_and_a_vignetting_of_no_camera_are_none_and_counted_once() -> None:
+    light = Light(Stats())
+    light.looks = [Look.of(np.zeros((48, 64, 3), np.uint8), INTRINSICS, 0.0, 48 * 64)] * 2
+    gains, vignetting = np.log([20.0, 1.5]), np.array([0.0, -9.0, 0.0])
+    light.photometry = replace(PhotometricCalibration.steady(2), gains=gains, vignetting=vignetting)
+    light._lights = dict(enumerate(light.photometry.lights))
+    for _ in range(2):
+        found = light.exposures()
+        assert found is not None
+        assert np.isfinite(found).all(axis=(1, 2)).tolist() == [False, True]
+        assert light.exposure(0) is None
+        assert light.vignetting is None
+    assert light.stats.counts["refused_exposures"] == 2, "an exposure and the vignetting"

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from mvsgs_core.photographs.ordering import chain, covisibility
-from mvsgs_core.photographs.reconstruction import Model, Reconstruction, all_models, connected
+from mvsgs_core.photographs.reconstruction import Reconstruction, all_models, connected
 from mvsgs_core.photographs.registration import MIN_SEEN, register
+from mvsgs_core.photographs.sparse_map import Model
 from mvsgs_core.photographs.tracks import link
 from mvsgs_core.photographs.two_views import TwoViews
 from tests.support.photograph_ring import SIZE, Ring, position_error, ring
