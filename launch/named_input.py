@@ -12,7 +12,7 @@ from pathlib import Path
 
 from launch.refusal import GraphError
 from mvsgs_core.datasets import recognized
-from mvsgs_core.datasets.files import IMAGE_SUFFIXES
+from mvsgs_core.datasets.files import IMAGE_SUFFIXES, visible
 from mvsgs_core.datasets.mcap_file import ROS_2, profile_of
 from nodes.parameters import did_you_mean
 
@@ -22,6 +22,7 @@ SCHEMES = {
     **dict.fromkeys(("tcp", "ipc"), "robot"),
 }
 RECORDING = ".mcap"  # a recording of ours, or a bag of ROS 2
+PREVIEW = ".lrv"  # a small copy that a camera puts beside its video: GL010001.LRV of GX010001.MP4
 MAPS = (".ply", ".spz", ".splat")
 # Hydra's own options that take a word of their own after them
 _WITH_VALUE = ("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd", "--package", "-p", "--cfg", "-c",
@@ -86,7 +87,7 @@ def _meaning(word: str, choices: Sequence[str]) -> list[str]:
         raise GraphError(f"{word}: {error.strerror or error}") from error
     if word in choices:
         return [f"{SLOT}={word}"]
-    beside = [str(path.with_name(p.name)) for p in path.parent.iterdir()] if path.parent.is_dir() else []
+    beside = [str(path.with_name(p.name)) for p in visible(path.parent, "*")]
     near = did_you_mean(word, [*choices, *beside])
     raise GraphError(
         f"{word}: there is no such file or folder here{near}; give a video, a folder of images, an address, a camera's "
@@ -116,7 +117,7 @@ def _of_folder(path: Path) -> str:
         return found[0]
     if found:
         raise GraphError(f"{path}: is in the layouts of {' and '.join(found)}; say which with {SLOT}={found[0]}")
-    within = sorted(path.iterdir())
+    within = sorted(visible(path, "*"), key=lambda inner: (inner.suffix.lower() == PREVIEW, inner))
     if not within:
         raise GraphError(f"{path}: is an empty folder")
     usable = [inner for inner in within if inner.suffix.lower() == RECORDING or _any(inner)]

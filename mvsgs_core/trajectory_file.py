@@ -30,7 +30,7 @@ def read_trajectory(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """
     rows: list[list[float]] = []
     count, late = 0, []  # rows, and those at no time in seconds
-    for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+    for number, line in enumerate(file.read_text(encoding="utf-8-sig", errors="replace").splitlines(), start=1):
         text = line.split("#")[0].replace(",", " ").split()
         if not text:
             continue

@@ -150,6 +150,9 @@ def test_any_name_reaches_the_reader_as_it_is(name: str, tmp_path: Path) -> None
     assert graph.slots["dataset"].config["path"] == str(tmp_path / name)
 
 
+HIDDEN = ("gopro/._GX010001.MP4", "gopro/GL010001.LRV", "gopro/GX010001.MP4", "hidden/.DS_Store")
+
+
 @pytest.mark.parametrize(
     ("word", "said"),
     [
@@ -165,15 +168,17 @@ def test_any_name_reaches_the_reader_as_it_is(name: str, tmp_path: Path) -> None
         ("run", "is the output of a run; `mvsgs view run` shows its map, resume=run goes on"),
         ("texts/a.txt", "its name does not say what it is; if it is a video: dataset=video"),
         ("both", "is in the layouts of replica and tum; say which with dataset=replica"),
+        ("gopro", "is no data set itself; give gopro/GX010001.MP4 or 1 more in it"),
+        ("hidden", "is an empty folder"),
     ],
 )
 def test_what_cannot_be_told_is_said_in_one_line(
     word: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for folder in ("empty", "texts", "run"):
+    for folder in ("empty", "texts", "run", "gopro", "hidden"):
         (tmp_path / folder).mkdir()
-    for file in ("walk.mp4", "map.ply", "texts/a.txt", "run/config.yaml", "run/map.ply", "run/comparison.png"):
+    for file in ("walk.mp4", "map.ply", "texts/a.txt", "run/config.yaml", "run/map.ply", "run/comparison.png", *HIDDEN):
         (tmp_path / file).touch()
     write_photos(tmp_path / "photos", 2)
     for name in ("a", "b"):

@@ -36,6 +36,7 @@ class Item:
     exposure: float = 0.0  # exposure time times gain over f-number², in a unit that the sequence keeps; 0: not known
     place: np.ndarray | None = None  # (3,) float64 latitude, longitude (degrees), altitude (m) by GPS
     mask: np.ndarray | None = None  # (H, W) bool, False where a pixel is to be ignored; None: all count
+    original: np.ndarray | None = None  # (4,) float64 intrinsics before undistortion and scaling; None: of this image
 
 
 class Sequence(Protocol):

@@ -153,7 +153,10 @@ class Bag(FileReader):
         framed, intrinsics = self._framing.image(image, lens, size)
         mask = None if self._camera_mask is None else self._camera_mask.framed(self._framing, lens, size)
         place, guessed = self._place(stamp), self._lens.guessed
-        return Item(index, seconds, framed, intrinsics, intrinsics_guessed=guessed, place=place, mask=mask)
+        original = np.array(self._lens.intrinsics, np.float64)
+        return Item(
+            index, seconds, framed, intrinsics, intrinsics_guessed=guessed, place=place, mask=mask, original=original
+        )
 
 
 def _image_topic(bag: OpenBag, given: str | None) -> str:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets.exif import exif_doubt, read_exif_lens
@@ -12,6 +15,7 @@ from mvsgs_core.datasets.files import UnreadableImageError, opened_image, uprigh
 from mvsgs_core.datasets.lens import Lens, guess_lens
 
 FISHEYE = "fisheye"  # first of the distortion: what follows are the four coefficients of OpenCV's fisheye model
+_SEEN = 0.9  # of an image, about its middle: where principal points are of pictures that were not cropped
 
 
 def lens_from_option(
@@ -20,8 +24,8 @@ def lens_from_option(
     """The lens of the option `intrinsics`: [fx, fy, cx, cy] in pixels of the original image (height, width), or "auto".
 
     distortion: OpenCV's coefficients, "fisheye" before them where they are of that model.
-    Returns the lens and warnings: "auto" is a guess and says so, also in `Lens.guessed`. Raises ValueError for anything
-    else.
+    Returns the lens and warnings: "auto" is a guess and says so, also in `Lens.guessed`; numbers may look like those of
+    another size. Raises ValueError for anything else.
     """
     coefficients, fisheye = _model(distortion)
     if isinstance(intrinsics, str):
@@ -36,7 +40,43 @@ def lens_from_option(
     values = [float(v) for v in intrinsics]
     if len(values) != 4:
         raise ValueError(f"intrinsics is [fx, fy, cx, cy] in pixels of the original image, got {list(intrinsics)}")
-    return Lens((values[0], values[1], values[2], values[3]), size, coefficients, fisheye), []
+    lens = Lens((values[0], values[1], values[2], values[3]), size, coefficients, fisheye)
+    return lens, size_doubt(lens)
+
+
+def check_lens_option(
+    intrinsics: Sequence[float] | str, distortion: Sequence[float | str], size: Sequence[int] | None = None
+) -> None:
+    """Raises ValueError for what `lens_from_option` would not take, of a camera whose images did not come yet.
+
+    size: (height, width) that it was asked for; None: twice as far as the principal point.
+    """
+    if size is None:
+        numbers = [] if isinstance(intrinsics, str) else [float(v) for v in intrinsics]
+        sides = [2.0 * v + 1.0 for v in numbers[3:1:-1]]
+        told = len(sides) == 2 and all(math.isfinite(v) and v >= 1.0 for v in sides)
+        size = [round(v) for v in sides] if told else (480, 640)
+    lens_from_option(intrinsics, distortion, (size[0], size[1]))
+
+
+def size_doubt(lens: Lens) -> list[str]:
+    """What to say of intrinsics that look like those of images of another size than the lens's."""
+    (height, width), (_, _, cx, cy) = lens.size, lens.intrinsics
+    if abs(2 * cx + 1 - width) <= _SEEN * width and abs(2 * cy + 1 - height) <= _SEEN * height:
+        return []
+    such = f" (about {2 * cx + 1:.0f}x{2 * cy + 1:.0f})" if min(cx, cy) > 0 else ""
+    return [
+        f"the principal point cx, cy = {cx:g}, {cy:g} lies at the border of images of {width}x{height} or outside: "
+        f"unless they were cropped, the intrinsics are those of another size{such} and must be scaled to theirs"
+    ]
+
+
+def lens_of_matrix(matrix: np.ndarray, size: tuple[int, int]) -> Lens:
+    """Of the numbers (9,), (12,) or (16,) of a camera matrix, row by row. Raises ValueError for what no camera has."""
+    columns = {9: 3, 12: 4, 16: 4}.get(matrix.size)
+    if columns is None:
+        raise ValueError(f"a camera matrix has 3x3 or 4x4 numbers, this one has {matrix.size}")
+    return Lens((float(matrix[0]), float(matrix[columns + 1]), float(matrix[2]), float(matrix[columns + 2])), size)
 
 
 def _model(distortion: Sequence[float | str]) -> tuple[tuple[float, ...], bool]:

@@ -16,7 +16,10 @@ from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import Model, Shot, rigid
 from mvsgs_core.geometry import inverse, rotation_from_quaternion
 
-FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap", "dense/sparse", ".")
+FOLDERS = (
+    "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap", "dense/sparse", ".",
+    "dslr_calibration_undistorted",  # ETH3D's photographs
+)  # fmt: skip
 
 # name, number of parameters, in the order of COLMAP's model ids
 _MODELS = (
@@ -79,7 +82,7 @@ def _shot(lens: Lens, quaternion: Sequence[float], translation: Sequence[float])
 
 def _text_cameras(path: Path) -> dict[int, Lens]:
     lenses = {}
-    for line in path.read_text(encoding="utf-8").splitlines():
+    for line in path.read_text(encoding="utf-8-sig").splitlines():
         parts = line.split()
         if parts and not line.startswith("#"):
             lenses[int(parts[0])] = lens_of(parts[1], int(parts[2]), int(parts[3]), [float(v) for v in parts[4:]])
@@ -88,7 +91,7 @@ def _text_cameras(path: Path) -> dict[int, Lens]:
 
 def _text_images(path: Path, lenses: dict[int, Lens]) -> dict[str, Shot]:
     shots = {}
-    lines = iter(line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#"))
+    lines = iter(line for line in path.read_text(encoding="utf-8-sig").splitlines() if not line.startswith("#"))
     for line in lines:
         parts = line.split(maxsplit=9)
         if not parts:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 from mvsgs_core.bad_file import BadFileError, brief
 from mvsgs_core.datasets.compression import decompress
-from mvsgs_core.datasets.files import natural_order
+from mvsgs_core.datasets.files import natural_order, visible
 from mvsgs_core.datasets.mcap_file import ROS_2, McapFile, profile_of
 from mvsgs_core.datasets.sequence import Notices
 
@@ -162,7 +162,7 @@ def of_one_bag(folder: Path, suffix: str) -> list[Path]:
     be passed over: metadata.yaml alone says which parts there are."""
     if any(folder.glob("*.zstd")):
         return []
-    files = filter(Path.is_file, folder.glob(f"*{suffix}"))
+    files = filter(Path.is_file, visible(folder, f"*{suffix}"))
     found = sorted(files, key=lambda file: natural_order(file.name))
     names = {_NUMBERED.sub("", file.stem) if _NUMBERED.search(file.stem) else None for file in found}
     return found if len(found) == 1 or (len(names) == 1 and None not in names) else []

@@ -96,7 +96,7 @@ class Euroc(ImageSequence):
 def _rows(path: Path) -> list[tuple[float, list[str]]]:
     """Time in seconds and the other columns of each line. Raises BadFileError."""
     rows = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in path.read_text(encoding="utf-8-sig", errors="replace").splitlines():
         time, *others = (part.strip() for part in line.split(","))
         if not time or time.startswith("#"):
             continue

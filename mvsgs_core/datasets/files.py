@@ -157,7 +157,13 @@ def read_numbers(path: Path) -> np.ndarray:
     Raises BadFileError for anything else, OSError for a file that cannot be read.
     """
     with reading(path, "must hold numbers and nothing else"):
-        return np.array([float(v) for v in path.read_text(encoding="utf-8").split()])
+        return np.array([float(v) for v in path.read_text(encoding="utf-8-sig").split()])
+
+
+def visible(folder: Path, pattern: str) -> list[Path]:
+    """What a pattern finds in a folder, in the order of names, without hidden files: on other disks macOS puts `._NAME`
+    beside each NAME."""
+    return sorted(path for path in folder.glob(pattern) if not path.name.startswith("."))
 
 
 def inside(folder: Path, name: str, listing: Path) -> Path:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mvsgs_core.datasets import dataset
-from mvsgs_core.datasets.files import Layout, numbered_images
+from mvsgs_core.datasets.files import Layout, numbered_images, visible
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.sequence import DepthFormat, Found, ImageSequence, Record
 from mvsgs_core.trajectory_file import read_trajectory
@@ -65,7 +65,7 @@ def _mirror(pose: np.ndarray) -> np.ndarray:
 
 
 def _truth_files(folder: Path) -> list[Path]:
-    return [p for p in (folder / "groundtruth.txt", *sorted(folder.glob("*.gt.freiburg"))) if p.is_file()]
+    return [p for p in (folder / "groundtruth.txt", *visible(folder, "*.gt.freiburg")) if p.is_file()]
 
 
 def _poses(folder: Path) -> tuple[dict[int, np.ndarray], list[str]]:

@@ -41,8 +41,8 @@ LAYOUT = Layout(
     "A folder of images",
     "photographs or frames (" + ", ".join(IMAGE_SUFFIXES) + ") in the order of their names, in the folder or in its "
     "subfolder images/; beside them, if there is one, a COLMAP model (sparse/0), a transforms.json, .camera files, "
-    "or what Polycam (raw data) or Record3D exported; a scene of ScanNet++; masks (black: ignored) in masks/ under the "
-    "images' names",
+    "or what Polycam (raw data) or Record3D exported; a scene of ScanNet++ or ETH3D; masks (black: ignored) in masks/ "
+    "under the images' names",
     "your own camera; frames of a video: ffmpeg -i video.mp4 -qscale:v 2 images/%05d.jpg (or dataset=video directly)",
 )
 _SUBFOLDERS = ("images", "rgb", "input", "frames")
@@ -68,10 +68,12 @@ class Images(ImageSequence):
     @staticmethod
     def recognizes(path: Path) -> bool:
         places = [place for place in _places(path) if place.is_dir()]
-        if any(file.suffix.lower() in IMAGE_SUFFIXES for place in places for file in place.iterdir()):
+        if any(is_image(file) for place in places for file in place.iterdir()):
             return True
-        subfolder = any((path / name).is_dir() for name in _SUBFOLDERS)  # with a folder of each camera in it
-        return subfolder and (find_colmap(path) is not None or find_transforms(path) is not None)
+        inside = path.name in _SUBFOLDERS  # with a folder of each camera in it
+        scene = path.absolute().parent if inside else path
+        subfolder = inside or any((path / name).is_dir() for name in _SUBFOLDERS)
+        return subfolder and (find_colmap(scene) is not None or find_transforms(scene) is not None)
 
     def _find(self) -> Found:
         if self.rate <= 0:
@@ -120,7 +122,9 @@ class Images(ImageSequence):
     def _lenses(self, images: list[Path], size: tuple[int, int], turn_upright: bool) -> list[Lens]:
         """size: (height, width) of an image whose lens is given or guessed."""
         if self.intrinsics not in (None, "auto"):
-            return [lens_from_option(self.intrinsics, self.distortion, size)[0]] * len(images)
+            lens, notices = lens_from_option(self.intrinsics, self.distortion, size)
+            self.warnings += notices
+            return [lens] * len(images)
         found = [read_exif_lens(image, turn_upright=turn_upright) for image in images]
         known = [
             (image, lens) for image, lens in zip(images, found) if lens is not None and same_shape(lens.size, size)
@@ -200,25 +204,36 @@ def _places(folder: Path) -> list[Path]:
 
 
 def _find_images(folder: Path, notes: list[str]) -> list[Path]:
-    """The images in the folder, in one of its subfolders, or anywhere below; what is left out is told in `notes`."""
+    """The images in the folder, in one of its subfolders, or anywhere below, of a subfolder first, beside which copies
+    may lie; what is left out is told in `notes`."""
     found = {place: images for place in _places(folder) if place.is_dir() and (images := images_in(place))}
     place = next(iter(found), folder)
     inner = next((inner for inner in found if inner.parent == folder and inner.name in _SUBFOLDERS), place)
     if place == folder and len(found.get(inner, ())) >= _MANY * len(found.get(folder, ())):
         place = inner
-    below = [p for p in place.rglob("*") if is_image(p) and not _is_aside(p, place)]
-    below.sort(key=lambda p: natural_order(p.relative_to(place).as_posix()))
-    if place not in found:
-        if not below:
-            raise LAYOUT.missing(f"{folder} has no image")
-        return below
-    left = [p for p in below if p.parent != place]
-    if place.parent == folder and place.name in _SUBFOLDERS:
-        left += found.get(folder, [])
+    if place in found:
+        images, where = found[place], "directly in"
+        left = [p for p in _below(place) if p.parent != place]
+        if place.parent == folder and place.name in _SUBFOLDERS:
+            left += found.get(folder, [])
+    else:
+        where = "below"
+        for place in (*(folder / name for name in _SUBFOLDERS), folder):
+            if images := _below(place):
+                break
+        left = [] if place == folder else [p for p in _below(folder) if not p.is_relative_to(place)]
+    if not images:
+        raise LAYOUT.missing(f"{folder} has no image")
     if left:
         names = f"{len(left)} (first: {left[0].relative_to(folder).as_posix()})"
-        notes.append(f"the images are those directly in {place}; others in {folder} that are not read: {names}")
-    return found[place]
+        notes.append(f"the images are those {where} {place}; others in {folder} that are not read: {names}")
+    return images
+
+
+def _below(place: Path) -> list[Path]:
+    """All images in a folder and in those below it, in natural order."""
+    below = [p for p in place.rglob("*") if is_image(p) and not _is_aside(p, place)]
+    return sorted(below, key=lambda p: natural_order(p.relative_to(place).as_posix()))
 
 
 def _is_aside(path: Path, folder: Path) -> bool:
@@ -303,7 +318,7 @@ def _find_model(folder: Path, images: list[Path], given: str | Path | None, size
         raise FileNotFoundError(f"model {place} is missing: a folder with cameras and images of COLMAP, or {NAMES[0]}")
     if given is None and (scannetpp := read_scannetpp(images[0].parent, size)) is not None:
         return scannetpp
-    for base in dict.fromkeys((place, images[0].parent, images[0].parent.parent) if given is None else (place,)):
+    for base in dict.fromkeys([place, *_around(images[0])] if given is None else [place]):
         transforms = base if base.is_file() else find_transforms(base, place.name)
         colmap = find_colmap(base)
         if colmap is not None:
@@ -322,6 +337,12 @@ def _find_model(folder: Path, images: list[Path], given: str | Path | None, size
     if given is not None:
         raise ValueError(f"model {place} is neither a COLMAP model, nor a {NAMES[0]}, nor a folder of .camera files")
     return None
+
+
+def _around(image: Path) -> list[Path]:
+    """Folders above an image where its model may be: one more where each camera has a folder in images/."""
+    above = list(image.absolute().parents)
+    return above[: 3 if len(above) > 1 and above[1].name.partition("_")[0] in _SUBFOLDERS else 2]
 
 
 def _from_model(model: Model, folder: Path, images: list[Path], rate: float, notes: list[str]) -> list[Record]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.datasets import dataset
-from mvsgs_core.datasets.calibration import image_size
+from mvsgs_core.datasets.calibration import image_size, size_doubt
 from mvsgs_core.datasets.files import Layout, numbered_images, read_numbers
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import is_rigid
@@ -49,6 +49,7 @@ class Kitti(ImageSequence):
             raise LAYOUT.missing(f"{source} has no 000000.png, 000001.png, ...")
         published, cam0_from_cam = read_projection(LAYOUT.file(folder / "calib.txt"), f"P{camera}", images)
         lens = self._lens(images, published)
+        self.warnings += [] if self.intrinsics is not None else size_doubt(published)
         times, poses = self._times(folder, last=int(images[-1].stem)), self._poses(folder)
         records = []
         for image in images:

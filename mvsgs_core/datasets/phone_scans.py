@@ -12,22 +12,21 @@ from typing import Any
 import numpy as np
 
 from mvsgs_core.bad_file import reading
-from mvsgs_core.datasets.files import images_in
+from mvsgs_core.datasets.files import images_in, visible
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import Model, Shot, rigid
-from mvsgs_core.geometry import rotation_from_quaternion
+from mvsgs_core.geometry import OPENGL_FROM_OPENCV, rotation_from_quaternion
 
 # images and cameras below the folder; the app's own correction of the poses first
 _POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 _RECORD3D = "metadata.json"
-_OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
     """Images and cameras of Polycam's raw data, in `folder` or its `keyframes`."""
     for base in (folder / "keyframes", folder):
         for images, cameras in _POLYCAM:
-            if (base / images).is_dir() and next((base / cameras).glob("*.json"), None) is not None:
+            if (base / images).is_dir() and visible(base / cameras, "*.json"):
                 return base / images, base / cameras
     return None
 
@@ -35,7 +34,7 @@ def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
 def read_polycam(cameras: Path) -> Model:
     """The model of a folder of cameras, a JSON file an image. Raises BadFileError for a malformed one."""
     shots = {}
-    for path in sorted(cameras.glob("*.json")):
+    for path in visible(cameras, "*.json"):
         with reading(path, "is no camera of Polycam's that can be used"):
             c = json.loads(path.read_bytes())
             pose = np.eye(4)
@@ -46,9 +45,12 @@ def read_polycam(cameras: Path) -> Model:
 
 
 def find_record3d(folder: Path) -> Path | None:
-    """The file that describes an export of Record3D, whose images are in rgb/ beside it."""
+    """The file that describes an export of Record3D, with images in rgb/: other programs have one of its name, too."""
     path = folder / _RECORD3D
-    return path if path.is_file() and (folder / "rgb").is_dir() else None
+    if not (path.is_file() and (folder / "rgb").is_dir()):
+        return None
+    content = path.read_bytes()
+    return path if b'"K"' in content and b'"poses"' in content else None
 
 
 def read_record3d(path: Path) -> Model:
@@ -79,4 +81,4 @@ def _lens(fx: Any, fy: Any, cx: Any, cy: Any, size: tuple[int, int]) -> Lens:
 
 
 def _opencv(pose: np.ndarray) -> np.ndarray:
-    return rigid(pose, "its pose") @ _OPENGL_FROM_OPENCV
+    return rigid(pose, "its pose") @ OPENGL_FROM_OPENCV

@@ -9,7 +9,7 @@ import numpy as np
 
 from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.datasets import dataset
-from mvsgs_core.datasets.calibration import image_size
+from mvsgs_core.datasets.calibration import image_size, lens_of_matrix, size_doubt
 from mvsgs_core.datasets.files import Layout, numbered_images, read_numbers
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import read_pose
@@ -44,7 +44,9 @@ class ScanNet(ImageSequence):
         if not images:
             raise LAYOUT.missing(f"{folder / 'color'} has no 0.jpg, 1.jpg, ...")
         if self.intrinsics is None:
-            camera = _read_camera(LAYOUT.file(folder / "intrinsic" / "intrinsic_color.txt"), image_size(images))
+            path = LAYOUT.file(folder / "intrinsic" / "intrinsic_color.txt")
+            otherwise = "export them as they are, or set dataset.intrinsics=[fx,fy,cx,cy] in pixels of the images"
+            camera = _read_camera(path, image_size(images), otherwise)
         else:
             camera = self._given_lens(images, self.intrinsics)
         self._color_camera = camera
@@ -68,7 +70,7 @@ class ScanNet(ImageSequence):
         if not depths:
             return None
         if path.is_file():
-            return _read_camera(path, image_size(depths))
+            return _read_camera(path, image_size(depths), "export depth maps as they are, or leave them out")
         self.warnings.append(f"{path} is missing: depth maps are taken to be the color camera's")
         return None
 
@@ -79,11 +81,14 @@ class ScanNet(ImageSequence):
         return register(depth, self._depth_camera.at(size), self._color_camera.at(size), 0.0)
 
 
-def _read_camera(path: Path, size: tuple[int, int]) -> Lens:
-    """Of a 4x4 or 3x3 matrix, for images (height, width). Raises BadFileError."""
+def _read_camera(path: Path, size: tuple[int, int], otherwise: str) -> Lens:
+    """Of a 4x4 or 3x3 matrix, for images (height, width). Raises BadFileError, which says `otherwise` where those were
+    scaled: the file has no size of its own."""
     k = read_numbers(path)
     if k.size not in (9, 16):
         raise BadFileError(f"{path} must hold a 4x4 camera matrix, it has {k.size} numbers")
-    side = 4 if k.size == 16 else 3
     with reading(path, "holds a camera that cannot be"):
-        return Lens((float(k[0]), float(k[side + 1]), float(k[2]), float(k[side + 2])), size)
+        lens = lens_of_matrix(k, size)
+    if doubt := size_doubt(lens):
+        raise BadFileError(f"{path}: {doubt[0]}; {otherwise}")
+    return lens

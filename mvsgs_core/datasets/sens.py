@@ -16,7 +16,7 @@ import numpy as np
 from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.datasets import Item, dataset
 from mvsgs_core.datasets.calibration import lens_from_option
-from mvsgs_core.datasets.files import MAX_PIXELS, Layout, UnreadableImageError, read_image
+from mvsgs_core.datasets.files import MAX_PIXELS, Layout, UnreadableImageError, read_image, visible
 from mvsgs_core.datasets.framing import same_shape
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import is_rigid
@@ -132,7 +132,8 @@ class Sens(FileReader):
         if depth is not None:
             depth = self._framing.depth(depth, self._lens, size)
         place, guessed = self._place(seconds), self._lens.guessed
-        return Item(index, seconds, framed, intrinsics, frame.world_from_cam, depth, guessed, place=place, mask=mask)
+        pose, original = frame.world_from_cam, np.array(self._lens.intrinsics, np.float64)
+        return Item(index, seconds, framed, intrinsics, pose, depth, guessed, place=place, mask=mask, original=original)
 
     def _image(self, data: bytes, number: int) -> np.ndarray:
         """(H, W, 3) uint8 RGB. Raises UnreadableImageError."""
@@ -180,7 +181,7 @@ def _file(path: Path) -> Path:
 
 def _file_in(folder: Path) -> Path | None:
     """The only one of a folder."""
-    found = [path for path in folder.glob("*.sens") if path.is_file()]
+    found = [path for path in visible(folder, "*.sens") if path.is_file()]
     return found[0] if len(found) == 1 else None
 
 

@@ -271,7 +271,10 @@ class ImageSequence(FileReader, ABC):
             depth = self._framing.depth(depth, lens, size)
         pose, exposure = record.world_from_cam, self._exposure(record)
         place = self._own_place(record) if self._gps is None else self._given_place(record)
-        return Item(index, record.timestamp, framed, intrinsics, pose, depth, lens.guessed, exposure, place, mask)
+        original = np.array(record.lens.at(usual or native).intrinsics, np.float64)
+        return Item(
+            index, record.timestamp, framed, intrinsics, pose, depth, lens.guessed, exposure, place, mask, original
+        )
 
     def _own_place(self, record: Record) -> np.ndarray | None:
         """As in `Item`: of most sets nothing is known of it."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from mvsgs_core.bad_file import reading
-from mvsgs_core.datasets.files import read_numbers
+from mvsgs_core.datasets.files import read_numbers, visible
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import Model, Shot, rigid
 
@@ -17,13 +17,13 @@ _NUMBERS = 9 + 3 + 9 + 3 + 2  # K, distortion, rotation camera to world, center,
 
 def find_strecha(folder: Path) -> Path | None:
     """The folder with 0000.jpg.camera, ... files."""
-    return next((folder / name for name in FOLDERS if any((folder / name).glob("*.camera"))), None)
+    return next((folder / name for name in FOLDERS if visible(folder / name, "*.camera")), None)
 
 
 def read_strecha(folder: Path) -> Model:
     """The model of a folder of .camera files. Raises BadFileError for a malformed one."""
     shots = {}
-    for path in sorted(folder.glob("*.camera")):
+    for path in visible(folder, "*.camera"):
         values = read_numbers(path)
         with reading(path, "is no camera of Strecha's that can be used"):
             shots[path.name.removesuffix(".camera")] = _shot(values)

@@ -8,13 +8,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..scene import town
-from ..scene.difficulties import Difficulties, DifficultPath, Sensor
-from ..scene.renderer import Rendering
-from ..scene.stage import SCENES, stage
-from . import Item, dataset
-from .framing import target_size
-from .lens import Lens
+from mvsgs_core.datasets import Item, dataset
+from mvsgs_core.datasets.framing import target_size
+from mvsgs_core.datasets.lens import Lens
+from mvsgs_core.scene import town
+from mvsgs_core.scene.difficulties import Difficulties, DifficultPath, Sensor
+from mvsgs_core.scene.renderer import Rendering
+from mvsgs_core.scene.stage import SCENES, stage
 
 FPS = 20.0
 SIZE = (240, 320)  # height, width

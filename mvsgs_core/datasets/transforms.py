@@ -14,11 +14,11 @@ from mvsgs_core.bad_file import reading
 from mvsgs_core.datasets.files import IMAGE_SUFFIXES, inside
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import Model, Shot, rigid
+from mvsgs_core.geometry import OPENGL_FROM_OPENCV
 
 _FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 _PINHOLES = (None, "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")  # with no distortion or OpenCV's
 NAMES = ("transforms.json", "transforms_train.json")
-_OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def find_transforms(folder: Path, part: str = "") -> Path | None:
@@ -45,7 +45,7 @@ def read_transforms(path: Path, image_size: tuple[int, int], masks: Path | None 
                 lens, mask = _lens({**content, **frame}, image_size), frame.get("mask_path", content.get("mask_path"))
                 there = mask is not None and (masks is None or masks.is_dir())
                 masked = inside(masks or path.parent, mask, path) if there else None
-                shots[_relative(name)] = Shot(lens, pose @ _OPENGL_FROM_OPENCV, masked)
+                shots[_relative(name)] = Shot(lens, pose @ OPENGL_FROM_OPENCV, masked)
     return Model("transforms.json", shots)
 
 

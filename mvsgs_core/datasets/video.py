@@ -175,7 +175,11 @@ class Video(FileReader):
         image, intrinsics = self._framing.image(picture.rgb, lens, self._framing.size_of(self._native))
         mask = None if self._camera_mask is None else self._camera_mask.framed(self._framing, lens, image.shape[:2])
         place, guessed = self._place(picture.seconds, began=partial(_began, self._path)), self._lens.guessed
-        return Item(index, picture.seconds, image, intrinsics, intrinsics_guessed=guessed, place=place, mask=mask)
+        original = np.array(self._lens.intrinsics, np.float64)
+        return Item(
+            index, picture.seconds, image, intrinsics, intrinsics_guessed=guessed, place=place, mask=mask,
+            original=original,
+        )  # fmt: skip
 
     def _judge_end(self, frames: int, seconds: float) -> None:
         """Warns where the file ends after `frames`, the last `seconds` after the first, and promised more than that."""

@@ -16,9 +16,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ..datasets import Item
-from ..datasets.synthetic import Synthetic
-from ..geometry import quaternion_from_rotation
+from mvsgs_core.datasets import Item
+from mvsgs_core.datasets.synthetic import Synthetic
+from mvsgs_core.geometry import quaternion_from_rotation
 
 UNITS_PER_METER = 5000.0  # of the 16-bit depth images, as in the original sets
 

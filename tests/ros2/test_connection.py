@@ -51,6 +51,13 @@ def test_cyclone_is_told_the_interface_and_where_memory_ends(monkeypatch: pytest
     assert auto.endswith(",file:///my.xml")
 
 
+def test_intrinsics_of_a_camera_of_any_size_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nodes.ros2_camera.check_installed", lambda: None)
+    Ros2Camera.check(Ros2Camera.Config(intrinsics=[2800.0, 2800.0, 1919.5, 1079.5]))
+    with pytest.raises(ValueError, match="focal lengths must be positive"):
+        Ros2Camera.check(Ros2Camera.Config(intrinsics=[-1.0, 2800.0, 1919.5, 1079.5]))
+
+
 def test_without_dds_the_launcher_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     for node in (Ros2Camera, Ros2Publisher):

@@ -54,6 +54,15 @@ def test_the_files_of_a_bag_of_ros_2_follow_one_another(tmp_path: Path) -> None:
     assert [int(item.image[0, 0, 0]) - 20 for item in sequence] == list(range(12))
 
 
+def test_a_hidden_file_of_another_disk_is_none_of_the_bag(tmp_path: Path) -> None:
+    with Writer2(tmp_path / "walk", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        write_walk(Messages(2), writer)
+    (tmp_path / "walk/metadata.yaml").unlink()
+    (tmp_path / "walk/._walk.mcap").write_bytes(b"\x00\x05\x16\x07Mac OS X")
+    assert recognized(tmp_path / "walk") == ["bag"]
+    assert len(open_dataset("bag", path=tmp_path / "walk")) == 6
+
+
 @pytest.mark.parametrize("end", ["no index", "within a chunk", "within a chunk that is open"])
 def test_a_bag_of_ros_1_whose_recorder_was_killed_is_read(tmp_path: Path, end: str) -> None:
     ros, path = Messages(1), tmp_path / "walk.bag"

@@ -169,6 +169,8 @@ def test_strecha_cameras_are_for_the_full_size(tmp_path: Path) -> None:
     item = list(open_dataset("images", path=tmp_path))[1]
     np.testing.assert_allclose(item.intrinsics, [50, 51, 31.5, 23.5])
     np.testing.assert_allclose(item.world_from_cam, [[1, 0, 0, 5], [0, 0, -1, 6], [0, 1, 0, 7], [0, 0, 0, 1]])
+    (tmp_path / "gt_dense_cameras/._photo0.jpg.camera").write_bytes(b"\x00\x05\x16\x07Mac OS X")
+    assert len(list(open_dataset("images", path=tmp_path))) == 2
     (tmp_path / "gt_dense_cameras/photo0.jpg.camera").write_text("1 2 3")
     with pytest.raises(ValueError, match="must hold 26 numbers"):
         open_dataset("images", path=tmp_path)
@@ -248,6 +250,8 @@ def test_natural_order_and_subfolders(tmp_path: Path) -> None:
     assert [item.image[0, 0, 0] for item in items] == list(range(20, 31))
     assert items[10].timestamp == pytest.approx(1.0)
     np.testing.assert_allclose(items[0].intrinsics, [50, 51, 31.5, 23.5])
+    large = open_dataset("images", path=tmp_path, intrinsics=[100, 102, 63.5, 47.5])
+    assert any("of another size (about 128x96)" in w for w in large.warnings)
 
 
 def test_without_calibration_it_says_what_to_do(tmp_path: Path) -> None:

@@ -109,6 +109,13 @@ def test_icl_nuim(tmp_path: Path) -> None:
     np.testing.assert_allclose(items[3].depth, 2.0)
 
 
+def test_hidden_files_of_another_disk_are_no_poses(tmp_path: Path) -> None:
+    folder = write_icl_nuim(tmp_path, 3)
+    (folder / "groundtruth.txt").rename(folder / "livingRoom0.gt.freiburg")
+    (folder / "._livingRoom0.gt.freiburg").write_bytes(b"\x00\x05\x16\x07Mac OS X")
+    assert [item.world_from_cam is not None for item in open_dataset("icl_nuim", path=folder)] == [False, True, True]
+
+
 def test_noise_where_nothing_is_known_is_no_depth(tmp_path: Path) -> None:
     """The noisy variant's maps have 1 to 3 centimeters there."""
     folder = write_icl_nuim(tmp_path, 2)

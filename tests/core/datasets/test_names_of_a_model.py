@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mvsgs_core.datasets import open_dataset
+from mvsgs_core.datasets import open_dataset, recognized
 from tests.support.dataset_folders import colmap_text, write_image
 
 
@@ -63,3 +63,49 @@ def test_the_parts_of_nerfs_own_sets(tmp_path: Path) -> None:
         (tmp_path / f"transforms_{part}.json").write_text(json.dumps(content))
     assert [places(tmp_path / part) for part in ("train", "test")] == [[0.0], [5.0]]
     assert places(tmp_path) == [None, 0.0], "test/ and train/, by the file of train/"
+
+
+def _rig(folder: Path) -> None:
+    names = [f"{camera}/{i}.png" for camera in ("cam1", "cam2") for i in range(2)]
+    for name in names:
+        write_image(folder / "images" / name, 20)
+    colmap_text(folder / "sparse/0", names)
+
+
+@pytest.mark.parametrize("copies", ["input", "dense/0/images", "images_2"])
+def test_copies_beside_a_folder_of_each_camera_are_not_read(copies: str, tmp_path: Path) -> None:
+    _rig(tmp_path)
+    shutil.copytree(tmp_path / "images", tmp_path / copies)
+    assert places(tmp_path) == [0.0, 1.0, 2.0, 3.0]
+    notes = open_dataset("images", path=tmp_path).warnings
+    assert any("images are those below" in w and f"not read: 4 (first: {copies}/cam1/0.png)" in w for w in notes)
+
+
+@pytest.mark.parametrize(("part", "stand"), [("images", [0.0, 1.0, 2.0, 3.0]), ("images/cam2", [2.0, 3.0])])
+def test_a_part_of_a_scene_has_the_model_of_the_scene(
+    part: str, stand: list[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _rig(tmp_path)
+    assert recognized(tmp_path / part) == ["images"]
+    assert places(tmp_path / part) == stand
+    monkeypatch.chdir(tmp_path / part)
+    assert places(Path()) == stand
+
+
+def test_eth3d(tmp_path: Path) -> None:
+    scene = tmp_path / "courtyard"
+    names = [f"dslr_images_undistorted/DSC_028{i}.JPG" for i in range(2)]
+    for name in names:
+        write_image(scene / "images" / name, 20)
+    colmap_text(scene / "dslr_calibration_undistorted", names)
+    for path in (scene, scene / "images", scene / "images/dslr_images_undistorted"):
+        assert recognized(path) == ["images"]
+        assert places(path) == [0.0, 1.0]
+
+
+def test_the_mark_that_windows_puts_before_a_text(tmp_path: Path) -> None:
+    write_image(tmp_path / "images/0.png", 20)
+    colmap_text(tmp_path / "sparse/0", ["0.png"])
+    for path in (tmp_path / "sparse/0").iterdir():
+        path.write_text(path.read_text(), encoding="utf-8-sig")
+    assert places(tmp_path) == [0.0]

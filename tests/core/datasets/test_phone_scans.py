@@ -70,3 +70,19 @@ def test_damaged_exports(tmp_path: Path) -> None:
     (tmp_path / "b/keyframes/corrected_cameras/101.json").write_text('{"t_00": 1}')
     with pytest.raises(BadFileError, match="no camera of Polycam's"):
         open_dataset("images", path=tmp_path / "b")
+
+
+def test_another_program_has_a_metadata_json_too(tmp_path: Path) -> None:
+    for i in range(2):
+        write_image(tmp_path / f"rgb/{i}.jpg", 20 + i)
+    (tmp_path / "metadata.json").write_text('{"device": "iPad", "fps": 30}')
+    sequence = open_dataset("images", path=tmp_path)
+    assert "no calibration" in sequence.warnings[0]
+    assert len(list(sequence)) == 2
+
+
+def test_hidden_files_of_another_disk_are_no_cameras(tmp_path: Path) -> None:
+    _polycam(tmp_path)
+    for path in [p for p in tmp_path.rglob("*") if p.is_file()]:
+        path.with_name(f"._{path.name}").write_bytes(b"\x00\x05\x16\x07Mac OS X")
+    assert len(list(open_dataset("images", path=tmp_path))) == 3

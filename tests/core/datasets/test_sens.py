@@ -49,6 +49,13 @@ def test_a_part_of_the_frames_with_another_camera_smaller(tmp_path: Path) -> Non
     assert recognized(tmp_path) == []
 
 
+def test_a_hidden_file_of_another_disk_is_none(tmp_path: Path) -> None:
+    path = write_sens(tmp_path / "scene.sens")
+    path.with_name("._scene.sens").write_bytes(b"\x00\x05\x16\x07Mac OS X")
+    assert recognized(tmp_path) == ["sens"]
+    assert len(open_dataset("sens", path=tmp_path)) == 4
+
+
 def test_a_file_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
     path = write_sens(tmp_path / "scene.sens")
     path.write_bytes(path.read_bytes()[:-10])

@@ -10,7 +10,7 @@ import pytest
 from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.datasets.lens import Lens
-from tests.support.dataset_folders import pose, write_tum
+from tests.support.dataset_folders import pose, write_depth, write_image, write_tum
 from tests.support.slam_folders import DRIFTS, write_euroc, write_kitti, write_scannet, write_tum_vi
 
 
@@ -196,3 +196,32 @@ def test_eth3d_has_its_camera_in_a_file(tmp_path: Path) -> None:
     folder = write_tum(tmp_path / "cables_1")
     (folder / "calibration.txt").write_text("60 61 32 24\n")
     np.testing.assert_allclose(next(iter(open_dataset("tum", path=folder))).intrinsics, [60, 61, 32, 24])
+
+
+def test_images_that_were_scaled_after_their_calibration(tmp_path: Path) -> None:
+    folder = write_scannet(tmp_path / "scannet", 2)
+    for i in range(2):
+        write_image(folder / f"color/{i}.png", 20 + i, (96, 128))
+    with pytest.raises(BadFileError, match=r"intrinsic_color\.txt: .* \(about 256x192\) .*; export .*dataset\.intr"):
+        open_dataset("scannet", path=folder)
+    given = open_dataset("scannet", path=folder, intrinsics=[100, 100, 63.5, 47.5])
+    assert not any("border" in w for w in given.warnings)
+    for i in range(2):
+        write_image(folder / f"color/{i}.png", 20 + i, (192, 256))
+        write_depth(folder / f"depth/{i}.png", 2000, (48, 64))
+    with pytest.raises(BadFileError, match=r"intrinsic_depth\.txt: .*export depth maps as they are"):
+        open_dataset("scannet", path=folder)
+    drive = write_kitti(tmp_path / "kitti")
+    for i in range(4):
+        write_image(drive / f"image_2/{i:06d}.png", 20 + i, (24, 32))
+    assert any("of another size (about 63x47)" in w for w in open_dataset("kitti", path=drive).warnings)
+    own = open_dataset("kitti", path=drive, intrinsics=[25, 25, 15.5, 11.5])
+    assert not any("border" in w for w in own.warnings)
+
+
+def test_the_mark_that_windows_puts_before_a_text(tmp_path: Path) -> None:
+    folder, drive = write_euroc(tmp_path / "euroc"), write_kitti(tmp_path / "kitti")
+    for file in (folder / "mav0/cam0/data.csv", drive / "times.txt"):
+        file.write_text(file.read_text(), encoding="utf-8-sig")
+    assert len(open_dataset("euroc", path=folder)) == 5
+    assert len(open_dataset("kitti", path=drive)) == 4

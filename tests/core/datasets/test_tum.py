@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.datasets.by_time import nearest
 from mvsgs_core.datasets.tum import CAMERAS
+from mvsgs_core.geometry import quaternion_from_rotation, so3_exp
 from mvsgs_core.trajectory_file import read_trajectory
 from tests.support.dataset_folders import pose, truncate, write_image, write_tum
 
@@ -170,3 +172,53 @@ def test_a_pose_between_two_of_motion_capture_is_interpolated(tmp_path: Path) ->
     for item, x in ((items[1], 1.4), (items[2], 5.0)):  # the second one's other neighbor is too far away
         assert item.world_from_cam is not None
         assert item.world_from_cam[0, 3] == pytest.approx(x)
+
+
+def test_bonn_has_poses_of_the_markers_on_its_camera(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "rgbd_bonn_balloon")
+    turned = so3_exp(np.array([0.2, -0.4, 0.1]))
+    w, x, y, z = quaternion_from_rotation(turned)
+    (folder / "groundtruth.txt").write_text(f"0 1 2 3 {x} {y} {z} {w}\n")
+    (folder / "depth.txt").unlink()
+    items = list(open_dataset("tum", path=folder))
+    assert items[0].world_from_cam is not None
+    # world and markers, in axes of ROS there
+    swap = np.array([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]])
+    world_from_markers = swap @ turned @ swap
+    np.testing.assert_allclose(
+        items[0].world_from_cam[:3, 3], swap @ [1, 2, 3] + world_from_markers @ [0.0113, -0.0098, 0.0111], atol=1e-6
+    )
+    rotation = items[0].world_from_cam[:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+    published = np.array([[1.0157, 0.1828, -0.2389], [0.0009, -0.8431, -0.6413], [-0.3009, 0.6147, -0.8085]])
+    np.testing.assert_allclose(world_from_markers.T @ rotation, published / 1.0593, atol=1e-3)
+    assert open_dataset("tum", path=folder).lens == CAMERAS["bonn"]
+    given = open_dataset("tum", path=folder, intrinsics=[50, 51, 31, 23])  # poses stay the markers'
+    np.testing.assert_allclose(next(iter(given)).world_from_cam, items[0].world_from_cam)
+    folder.rename(tmp_path / "balloon")
+    named = open_dataset("tum", path=tmp_path / "balloon", camera="bonn")
+    np.testing.assert_allclose(next(iter(named)).world_from_cam, items[0].world_from_cam)
+
+
+def test_comments_and_the_mark_that_windows_puts_before_a_text(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "x")
+    for name in ("rgb.txt", "groundtruth.txt"):
+        lines = (folder / name).read_text().splitlines()
+        (folder / name).write_text("\n".join(line for line in lines if line[0] != "#"), encoding="utf-8-sig")
+    (folder / "camera.txt").write_text("# fx fy cx cy\n60 61 32 24  # no distortion\n", encoding="utf-8-sig")
+    items = list(open_dataset("tum", path=folder))
+    np.testing.assert_allclose(items[0].intrinsics, [60, 61, 32, 24])
+    assert [item.world_from_cam is not None for item in items] == [True] * 5
+    (folder / "camera.txt").write_text("60 61 32 24", encoding="utf-8-sig")
+    np.testing.assert_allclose(next(iter(open_dataset("tum", path=folder))).intrinsics, [60, 61, 32, 24])
+
+
+def test_intrinsics_of_images_of_another_size_are_told_of(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "x")
+    told = r"cx, cy = 63, 47 lies at the border of images of 64x48 .* another size \(about 127x95\)"
+    (folder / "camera.txt").write_text("120 122 63 47\n")
+    for options in ({}, {"intrinsics": [120, 122, 63, 47]}):
+        assert any(re.search(told, w) for w in open_dataset("tum", path=folder, **options).warnings)
+    cropped = open_dataset("tum", path=folder, intrinsics=[60, 61, -5, 24])
+    assert any("lies at the border" in w and "about" not in w for w in cropped.warnings)
+    assert not any("border" in w for w in open_dataset("tum", path=folder, intrinsics=[60, 61, 50, 24]).warnings)
