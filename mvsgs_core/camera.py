@@ -12,6 +12,7 @@ _OFF_CENTER = 2.0  # image sizes from the middle: a principal point farther out 
 _LONGEST_SIDE = 2**20  # pixels
 CONTRAST, REST = 96, 0.98  # gray levels between the darkest and brightest of an image, without 1 % of it at each end
 BLACK, FLAT = 10, 4  # of an image that shows nothing: less bright, or with less contrast
+DARK, LIGHTS = 48, 0.08  # an image that is darker, but for this part of it, is of a dark place with lights in it
 DARKEST = 16  # gray level where contrast begins once it is stretched: some is darker
 MAX_READOUT_TIME = 0.2  # seconds from the first row to the last: a longer one is a mistake, of the unit for one
 
@@ -82,6 +83,33 @@ def project(points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     return np.stack([fx * points[..., 0] / z + cx, fy * points[..., 1] / z + cy], axis=-1)
 
 
+def straightened(x: np.ndarray, y: np.ndarray, k1: float, k2: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Points on the plane at distance 1, as a lens shows them, without its distortion 1 + k1 r² + k2 r⁴."""
+    if k1 == 0.0 and k2 == 0.0:
+        return x, y
+    straight_x, straight_y = x, y
+    for _ in range(10):
+        r2 = straight_x * straight_x + straight_y * straight_y
+        bent = np.maximum(1.0 + r2 * (k1 + r2 * k2), 0.1)
+        straight_x, straight_y = x / bent, y / bent
+    return straight_x, straight_y
+
+
+def pixel_motion(
+    x: np.ndarray, y: np.ndarray, near: np.ndarray, intrinsics: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(6, N) of each axis: how pixels move with the twist (translation, rotation) of the camera, by the interaction
+    matrix of visual servoing (Chaumette and Hutchinson 2006).
+
+    x, y: (N,) of the points on the plane at distance 1; near: (N,) their inverse depths.
+    """
+    zero = np.zeros_like(x)
+    of_u = np.stack([-near, zero, x * near, x * y, -(1.0 + x * x), y])
+    of_v = np.stack([zero, -near, y * near, 1.0 + y * y, -x * y, -x])
+    fx, fy = intrinsics[:2].astype(x.dtype)
+    return of_u * fx, of_v * fy
+
+
 def resize_image(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Image at (height, width): area filter when shrinking, linear when enlarging."""
     if image.shape[:2] == tuple(size):
@@ -94,12 +122,17 @@ def resize_image(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def stretching(gray: np.ndarray, seen: np.ndarray | None = None) -> np.ndarray | None:
     """(256,) uint8: the gray levels of a dark or hazy image (H, W) uint8 spread, so that texture shows as in any other.
 
-    None for what needs it not, and for a black image, as of a covered lens, or a flat one, which show nothing.
+    In a dark place lights do not count: with each that comes into view all would change otherwise. None for what needs
+    it not, and for a black image, as of a covered lens, or a flat one, which show nothing.
     seen: (H, W) bool, where it counts; None: everywhere.
     """
     values = gray if seen is None else gray[seen]
     below = np.cumsum(np.bincount(values.ravel(), minlength=256))
-    low, high = np.searchsorted(below, [(1.0 - REST) * 0.5 * below[-1], (1.0 + REST) * 0.5 * below[-1]])
+    ends = 0.5 * np.array([1.0 - REST, 1.0 + REST])
+    low, high = np.searchsorted(below, ends * below[-1])
+    dark = np.searchsorted(below, (1.0 - LIGHTS) * below[-1])
+    if high - low >= CONTRAST and dark < DARK:  # lights: what is white where the rest has contrast
+        low, high = np.searchsorted(below, ends * below[dark * (255 - DARKEST) // CONTRAST])
     if high < BLACK or high - low < FLAT or high - low >= CONTRAST:
         return None
     gain = CONTRAST / float(high - low)

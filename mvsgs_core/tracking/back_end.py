@@ -11,7 +11,7 @@ from mvsgs_core.tracking.estimation.bundle_adjustment import Solution, Solver
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import RecentImages
 from mvsgs_core.tracking.local_map import LocalMap
-from mvsgs_core.tracking.steps import Steps, whole
+from mvsgs_core.tracking.steps import Steps
 
 
 @dataclass(frozen=True)
@@ -31,15 +31,12 @@ class BackEnd:
         self.threads = threads
         self.pending = 0  # steps of background bundle adjustment that are still to do
 
-    def work(self, segment: int) -> str:
+    def working(self, segment: int) -> Steps[str]:
         """A portion of the background work, if there is any: one step for each new keyframe.
 
-        Returns why it failed, if it did: then the rest of it is given up.
+        What is to be solved is set up in one step and solved in the other. Gives why it failed, if it did: then the
+        rest of it is given up.
         """
-        return whole(self.working(segment))
-
-    def working(self, segment: int) -> Steps[str]:
-        """`work`: what is to be solved is set up in one step and solved in the other."""
         if self.pending == 0 or len(self.local_map.members(segment)) < 3:
             return ""
         solution = yield from self._adjusting(segment)
@@ -99,11 +96,8 @@ class BackEnd:
         self.graph.rescale(members, self._median_inverse_depth(members) / before)
         return solutions
 
-    def step(self, segment: int) -> Solution:
-        """One step of global bundle adjustment, of a large map around its newest keyframe: background work."""
-        return whole(self._adjusting(segment))
-
     def _adjusting(self, segment: int) -> Steps[Solution]:
+        """One step of global bundle adjustment, of a large map around its newest keyframe."""
         members = self.local_map.members(segment)
         if len(members) > self.config.max_keyframes:
             return (yield from self._adjusting_around(members))

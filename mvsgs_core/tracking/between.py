@@ -6,7 +6,7 @@ better ones. So the frames wait for that keyframe. Held-out frames never go out.
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping, Set
+from collections.abc import Container, Iterable, Mapping, Set
 from dataclasses import dataclass
 from functools import partial
 
@@ -40,6 +40,7 @@ class FramesBetween:
     def __init__(self, graph: KeyframeGraph, photometer: Photometer, limit: int, threads: int) -> None:
         self.graph, self.photometer, self.limit = graph, photometer, limit
         self.solver = Solver(steps=8, threads=threads)
+        self._held: dict[int, tuple[TrackingImage, FrameRecord]] = {}  # of keyframes that are solved and held
         self._complete: dict[int, tuple[TrackingImage, FrameRecord]] = {}  # of keyframes that are not solved yet
         self._newest: dict[int, tuple[TrackingImage, FrameRecord]] = {}  # since the last keyframe
         self._ended: dict[int, tuple[TrackingImage, FrameRecord]] = {}  # those of `_complete` that came last
@@ -47,7 +48,7 @@ class FramesBetween:
     @property
     def waiting(self) -> set[int]:
         """Frames whose images are needed until the next keyframe."""
-        return set(self._complete) | set(self._newest)
+        return set(self._held) | set(self._complete) | set(self._newest)
 
     def add(self, frame: TrackingImage, record: FrameRecord) -> None:
         """A frame that was followed and became no keyframe; its pose may still come, by `record`."""
@@ -63,7 +64,7 @@ class FramesBetween:
         self._ended, self._newest = self._newest, {}
 
     def forget(self) -> None:
-        """The keyframes that they are between are given up."""
+        """The keyframes that they are between are given up, those that are solved not."""
         self._complete, self._newest, self._ended = {}, {}, {}
 
     def forget_before(self, keyframe: int) -> None:
@@ -77,28 +78,30 @@ class FramesBetween:
 
     def hold(self, keyframes: int) -> None:
         """The keyframes that the frames were to `end` at are solved and wait themselves: so many, and few frames do."""
-        self._ended = {}
-        while len(self._complete) > HELD * keyframes:
-            del self._complete[spared({index: image for index, (image, _) in self._complete.items()})]
+        self._held |= self._complete
+        self._complete, self._ended = {}, {}
+        while len(self._held) > HELD * keyframes:
+            del self._held[spared({index: image for index, (image, _) in self._held.items()})]
 
     def close(self) -> frozenset[int]:
         """The keyframes that the frames were to `end` at go out: what waited for them is to be settled."""
-        closed, self._complete, self._ended = frozenset(self._complete), {}, {}
+        closed = frozenset(self._held | self._complete)
+        self._held, self._complete, self._ended = {}, {}, {}
         return closed
 
     def settle(
-        self, waiting: frozenset[int], keyframe: int, records: list[FrameRecord], published: Container[int]
+        self, waiting: frozenset[int], keyframes: Iterable[int], records: list[FrameRecord], published: Container[int]
     ) -> tuple[Between, ...]:
-        """Frames that waited, posed now that the graph has this keyframe.
+        """Frames that waited, posed now that the graph has these keyframes.
 
-        Those of its segment that their matches fit, from published keyframes. records: of all frames so far; what comes
-        before and after a frame tells its velocity.
+        Those of their segments that their matches fit, from published keyframes. records: of all frames so far; what
+        comes before and after a frame tells its velocity.
         """
-        segment = self.graph.keyframes[keyframe].segment
+        segments = list({self.graph.keyframes[index].segment for index in keyframes})
         around = _with_neighbors(records, waiting)
         track, found = solve_trajectory(around, self.graph, self.solver), []
         velocities = track.velocities_of(track.index)
-        for k in np.flatnonzero(track.posed & (track.segment == segment) & ~track.keyframe):
+        for k in np.flatnonzero(track.posed & np.isin(track.segment, segments) & ~track.keyframe):
             record = around[k]
             if record.index not in waiting or record.reference is None or record.reference not in published:
                 continue

@@ -17,12 +17,13 @@ from mvsgs_core.tracking.places.localization import Localization, localize
 
 FASTEST = 65504.0  # pixels a second: faster, of a timestamp that is wrong, is no number of an edge
 SAME = 6.0  # gray levels by which two images of the same view differ, in the mean
+BESIDE = 4.0  # of the flow of a frame that did not move: as much is seen beside what changes where it is masked
 AROUND = (3, 3)  # pixels of half size about a point: no masked one is among them, see MASK_MARGIN
 
 
 @dataclass(frozen=True)
 class FrontEndConfig:
-    still_flow: float = 0.001  # of the longer side: median flow below which a frame did not move and is skipped
+    still_flow: float = 0.00025  # of the longer side: median flow below which a frame did not move, but for noise
     feature_fraction: float = 0.5  # of the textured points: fewer found, and features are tried
     lost_fraction: float = 0.2  # fewer found: the frame is lost
     lost_inliers: float = 0.5  # of the matches, within 2 pixels of one pose: fewer, and the frame is lost
@@ -161,12 +162,21 @@ class FrontEnd:
         seen: (M,) bool, points found in the last image. moves: (M, 2) their flow since.
         """
         assert self.last is not None
-        if np.median(np.linalg.norm(moves[seen], axis=1)) >= self.config.still_flow * image.longer_side:
+        limit, flow = self.config.still_flow * image.longer_side, _median_norm(moves[seen])
+        if image.mask is not None and limit <= flow < BESIDE * limit:
+            unchanged = replace(image, gray=np.where(image.mask, image.gray, self.last.gray))
+            flow = _median_norm(sample_field(self.between.field(self.last, unchanged), self.propagated[seen]))
+        if flow >= limit:
             return False
         change = cv2.blur(cv2.absdiff(self.last.half, image.half), AROUND)
         height, width = change.shape
         u, v = np.clip(0.5 * self.propagated[seen], 0, [width - 1, height - 1]).astype(int).T
         return float(np.mean(change[v, u])) < SAME
+
+
+def _median_norm(vectors: np.ndarray) -> float:
+    """Of (N, 2); NaN of none."""
+    return float(np.median(np.linalg.norm(vectors, axis=1)))
 
 
 __all__ = ["FrontEnd", "FrontEndConfig", "Step"]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mvsgs_core.tracking.estimation.calibration import LAST
 from mvsgs_core.tracking.frames import FrameRecord
 from mvsgs_core.tracking.known_map import KnownMap
 from mvsgs_core.tracking.phase import Phase
@@ -29,6 +30,7 @@ def go_on(session: Session, known: KnownMap) -> None:
     graph.intrinsics, graph.vignetting = known.intrinsics.copy(), known.vignetting.copy()
     if session.calibration.readout_time is None:
         graph.readout_time, graph.reads_columns = known.readout_time, known.reads_columns
+        session.calibration.readout_of = min(len(known.keyframes), LAST)
     session.calibration.settled = True
     session.calibration.guessed = False
     session.calibration.of_map = True

@@ -71,6 +71,14 @@ class KeyframeGraph:
     def neighbors(self, index: int) -> set[int]:
         return self.edges.reached([index]) - {index}
 
+    def but_first(self, indices: Iterable[int]) -> set[int]:
+        """These without the first of each segment, which holds its place where the others' poses are free."""
+        order = sorted(indices)
+        first: dict[int, int] = {}
+        for index in order:
+            first.setdefault(self.keyframes[index].segment, index)
+        return set(order).difference(first.values())
+
     def predict(self, source: int, to: int) -> tuple[np.ndarray, np.ndarray]:
         """Where the points of `source` should be seen in `to`: (M, 2), NaN behind it; and inside the image (M,)."""
         at, inside = self.predict_pose(source, self.keyframes[to].cam_from_world)
@@ -174,7 +182,9 @@ class KeyframeGraph:
         if self.weighing:
             problem.static = np.stack([self.keyframes[index].static for index in order])
         yield
-        solution = adjust(problem, replace(solver, device=self.device))
+        # The ground below a drone that takes off sets the unit; soon all may be a hundred times as far.
+        farthest = solver.min_inverse_depth * min(1.0, float(np.median(problem.inverse_depth)))
+        solution = adjust(problem, replace(solver, device=self.device, min_inverse_depth=farthest))
         if not solution.failure:
             self.intrinsics = self.intrinsics * [solution.focal_factor, solution.focal_factor, 1.0, 1.0]
             for n, index in enumerate(order):
@@ -206,8 +216,7 @@ class KeyframeGraph:
         """Multiplies every length of these keyframes, as seen from the world's origin."""
         for index in indices:
             keyframe = self.keyframes[index]
-            keyframe.cam_from_world = keyframe.cam_from_world.copy()
-            keyframe.cam_from_world[:3, 3] *= factor
+            keyframe.cam_from_world = geometry.scaled(keyframe.cam_from_world, factor)
             keyframe.inverse_depth = keyframe.inverse_depth / factor
             keyframe.information = keyframe.information * factor**2
 

@@ -13,7 +13,7 @@ from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches, propagate
 from mvsgs_core.tracking.matching.matcher import Matcher
-from mvsgs_core.tracking.shared_scale import share_scale
+from mvsgs_core.tracking.shared_scale import share_scale, tied_parts
 from mvsgs_core.tracking.steps import Steps, whole
 
 
@@ -73,12 +73,17 @@ class Initializer:
 
     def abandon(self) -> None:
         """Forgets the waiting keyframes."""
-        for index in self.waiting:
+        self._give_up(list(self.waiting))
+        self._weak = {}
+
+    def _give_up(self, keyframes: list[int]) -> None:
+        """These wait no longer."""
+        for index in keyframes:
+            self.waiting.remove(index)
             self.graph.remove(index)
-        self.waiting, self._weak = [], {}
 
     def initialize(self, forced: bool = False, focal: FocalConfig | None = None) -> bool:
-        """Solves the waiting keyframes; True where that succeeded: they are then part of the map.
+        """Solves the waiting keyframes; True where that succeeded: those that the graph still has are part of the map.
 
         focal: how the graph's focal length is found too; None where it is known.
         """
@@ -86,9 +91,16 @@ class Initializer:
 
     def initializing(self, forced: bool = False, focal: FocalConfig | None = None) -> Steps[bool]:
         """`initialize`, a bundle adjustment a step."""
-        if len(self.waiting) < (3 if forced else self.config.min_keyframes):
+        needed = 3 if forced else self.config.min_keyframes
+        if len(self.waiting) < needed:
             return False
         self._tie()
+        if apart := self._apart(forced):
+            self._give_up(apart)
+            others = len(self.waiting)
+            self.diagnosis.failed(f"matches do not tie the keyframes: {len(apart)} to none of the {others} others")
+            if len(self.waiting) < needed:
+                return False
         criteria = self.config.forced if forced else self.config.criteria
         if focal is None:
             start = yield from reconstructing(self.graph, self.waiting, criteria, self.threads)
@@ -99,7 +111,7 @@ class Initializer:
         if start.failure:
             self.diagnosis.failed(start.failure)
             if len(self.waiting) >= self.config.max_keyframes:
-                self.graph.remove(self.waiting.pop(0))
+                self._give_up(self.waiting[:1])
             return False
         for n, index in enumerate(self.waiting):
             keyframe = self.graph.keyframes[index]
@@ -118,6 +130,12 @@ class Initializer:
         for pair, matches in self._weak.items():
             self.graph.connect(*pair, matches, self.config.weak_fraction)
         self._weak = {}
+
+    def _apart(self, forced: bool) -> list[int]:
+        """Keyframes that no edges tie to the newest, in the end to the most others: nothing tells their poses."""
+        parts = tied_parts(self.graph, self.waiting)
+        kept = max(parts, key=len) if forced else parts[-1]
+        return [index for index in self.waiting if index not in kept]
 
     def _connect(self, source: int, to: int, matches: Matches) -> None:
         if not self.graph.connect(source, to, matches, self.config.min_fraction):

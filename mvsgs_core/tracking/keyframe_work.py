@@ -8,7 +8,7 @@ from __future__ import annotations
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.back_end import BackEnd
 from mvsgs_core.tracking.config import TrackerConfig
-from mvsgs_core.tracking.estimation.calibration import REESTIMATED_AT, Calibration
+from mvsgs_core.tracking.estimation.calibration import Calibration
 from mvsgs_core.tracking.front_end import Step
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
@@ -58,11 +58,11 @@ class KeyframeWork:
 
     def tie(self, index: int) -> Steps[None]:
         """What an inserted keyframe tells of the camera, of the whole map and of the light."""
-        segment = self.graph.keyframes[index].segment
-        if len(self.graph.keyframes) in REESTIMATED_AT:
-            yield from self.calibration.estimating_readout(self.local_map.members(segment)[-12:])
+        members = self.local_map.members(self.graph.keyframes[index].segment)
+        if self.calibration.readout_due(len(members)):
+            yield from self.calibration.estimating_readout(members)
             yield
-        self.calibration.refine(self.local_map.members(segment))
+        self.calibration.refine()
         yield
         if self.config.loops:
             yield from self._close_loops(index)
@@ -75,7 +75,7 @@ class KeyframeWork:
         yield
         self._adjust_window(keyframes[-1])
         yield
-        self.calibration.refine(keyframes)
+        self.calibration.refine()
         yield
         if self.config.loops:
             for index in keyframes:

@@ -19,7 +19,7 @@ from mvsgs_core.tracking.graph import Edge, Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import CELL, TrackingImage
 from mvsgs_core.tracking.publish import Publisher
 
-FORMAT, VERSION = "mvsgs tracker", 2
+FORMAT, VERSION = "mvsgs tracker", 3
 WHAT = "tracker's half of a map"
 
 
@@ -117,7 +117,7 @@ def _unpacked(meta: dict[str, object], arrays: Arrays) -> KnownMap:
         raise ValueError(f"{size!r} is no size of the tracker's images")
     if type(readout_time) is not float or not is_readout_time(readout_time):
         raise ValueError(f"{readout_time!r} is no readout time")
-    reads_columns = meta.get("reads_columns", False)  # which an earlier version knew nothing of
+    reads_columns = meta.get("reads_columns")
     if type(reads_columns) is not bool:
         raise ValueError(f"{reads_columns!r} does not say whether columns are read")
     height, width = size
@@ -134,9 +134,7 @@ def _unpacked(meta: dict[str, object], arrays: Arrays) -> KnownMap:
     information = arrays.take("information", np.float64, (count, points))
     if (inverse_depth <= 0).any() or (information < 0).any():
         raise ValueError("its keyframes have depths that are none")
-    static = np.ones((count, points))
-    if "static" in arrays:  # which an earlier version knew nothing of
-        static = arrays.take("static", np.float32, (count, points)).astype(np.float64)
+    static = arrays.take("static", np.float32, (count, points)).astype(np.float64)
     if (static < 0).any() or (static > 1).any():
         raise ValueError("its keyframes have points that stand still more than wholly, or less than not at all")
     intrinsics = arrays.take("intrinsics", np.float64, (4,))

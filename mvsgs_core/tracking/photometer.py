@@ -14,7 +14,6 @@ from typing import Protocol
 
 import numpy as np
 
-from mvsgs_core.photometry import is_exposure, is_vignetting
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.estimation.gray_levels import (
     BESIDE,
@@ -24,8 +23,9 @@ from mvsgs_core.tracking.estimation.gray_levels import (
     log_ratio_moments,
     surrounded,
 )
-from mvsgs_core.tracking.estimation.photometry import PhotometricCalibration, PhotometricEdges, solve_photometry
-from mvsgs_core.tracking.estimation.response import radial_terms, vignetting_polynomial
+from mvsgs_core.tracking.estimation.lights import ImageLights, edges_between
+from mvsgs_core.tracking.estimation.photometry import PhotometricEdges
+from mvsgs_core.tracking.estimation.response import radial_terms
 from mvsgs_core.tracking.graph import Edge, KeyframeGraph
 from mvsgs_core.tracking.image import CELL, RecentImages, TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches
@@ -33,7 +33,6 @@ from mvsgs_core.tracking.steps import Steps, timed, whole
 
 GROWTH = 1.1  # of the keyframes, at which all are solved again
 AT_ONCE = 300  # keyframes that are solved together
-NO_LIGHT = "exposures or a vignetting that no camera has were found, and left out"
 
 _OBSERVATION = np.dtype(
     [("reference", "<i8"), ("moments", "<f4", (3, 2, TERMS))]
@@ -66,38 +65,13 @@ class FrameLight:
     light: bytes = b""  # see `observed`
 
 
-class Photometer:
+class Photometer(ImageLights):
     def __init__(self, graph: KeyframeGraph, stats: Stats) -> None:
+        super().__init__(stats)
         self.graph = graph
-        self.stats = stats
-        self.photometry = PhotometricCalibration.steady(0)
         self._order: list[int] = []  # keyframes of the last solution
-        self._lights: dict[int, np.ndarray] = {}  # (5,) of the keyframes, see `PhotometricCalibration.lights`
         self._moments: dict[tuple[int, int], tuple[Edge, np.ndarray | None]] = {}  # of every edge as it was matched
         self._looked_at = 0  # changes of the graph's edges
-        self._refused: set[int | None] = set()  # frames whose exposure no camera has; None: the vignetting
-
-    @property
-    def vignetting(self) -> np.ndarray | None:
-        """(3,) float32, see `msgs`; None: there is none, or none that a lens has."""
-        if not np.any(self.photometry.vignetting):
-            return None
-        found = vignetting_polynomial(self.photometry.vignetting, self.photometry.vignetting_response)
-        found = found.astype(np.float32)
-        if not is_vignetting(found):
-            self._refuse(None)
-            return None
-        return found
-
-    @property
-    def varies(self) -> bool:
-        return self.photometry.varies
-
-    def exposure(self, index: int) -> np.ndarray | None:
-        """(3, 4) float32 color affine of a keyframe; None where exposures do not vary, or it is one of no camera."""
-        if not self.photometry.varies or index not in self._lights:
-            return None
-        return self._affine(index, self._lights[index])
 
     def known(self, index: int) -> object:
         """What `exposure` is made of: an object that is another one whenever that changes."""
@@ -116,20 +90,6 @@ class Photometer:
                 found[k] = affine
         return found
 
-    def _affine(self, index: int, light: np.ndarray) -> np.ndarray | None:
-        """(3, 4) float32 of a frame's light (5,); None for one that no camera has: no reader takes it."""
-        affine = self.photometry.affine(light)
-        if not is_exposure(affine):
-            self._refuse(index)
-            return None
-        return affine
-
-    def _refuse(self, whose: int | None) -> None:
-        """Counts it once, however often it is asked for."""
-        if whose not in self._refused:
-            self._refused.add(whose)
-            self.stats.refuse("exposures", 1, NO_LIGHT)
-
     def update(self, at_the_end: bool = False) -> None:
         """Takes in the graph's new edges and keyframes. at_the_end: the stream has ended, all is solved for again."""
         whole(self.updating(at_the_end))
@@ -147,7 +107,7 @@ class Photometer:
         elif self.photometry.varies:
             for index in order:
                 if index not in self._lights:
-                    self._attach(index)
+                    self._attach_keyframe(index)
 
     def _looking_at_edges(self) -> Steps[None]:
         graph = self.graph
@@ -164,33 +124,23 @@ class Photometer:
 
     def edges(self, order: Sequence[int]) -> PhotometricEdges:
         """Of the keyframes `order`, by their places in it: a pair's both directions in one, from the earlier one."""
-        number = {index: n for n, index in enumerate(order)}
+        among = set(order)
         pairs: dict[tuple[int, int], np.ndarray] = {}
         for (a, b), (_, moments) in self._moments.items():
-            if moments is not None and a in number and b in number:
+            if moments is not None and a in among and b in among:
                 pair = min(a, b), max(a, b)
                 pairs[pair] = pairs.get(pair, 0.0) + (moments if a < b else backward(moments))
-        return PhotometricEdges(
-            np.array([number[a] for a, _ in pairs], np.int64),
-            np.array([number[b] for _, b in pairs], np.int64),
-            np.array(list(pairs.values())).reshape(-1, 3, TERMS, TERMS),
-        )
+        return edges_between(order, pairs)
 
     def _solve(self, order: list[int], at_the_end: bool) -> None:
         if len(order) > AT_ONCE:
             return self._solve_newest(order, at_the_end)
-        exposures = np.array([self.graph.keyframes[index].image.exposure for index in order])
-        known = np.where(exposures > 0.0, np.log(np.maximum(exposures, 1e-300)), np.nan)
-        try:
-            self.photometry = p = solve_photometry(self.edges(order), len(order), known)
-        except (np.linalg.LinAlgError, ValueError) as error:
-            self.stats.warn(f"exposures could not be solved for: {error}")
+        exposures = [self.graph.keyframes[index].image.exposure for index in order]
+        lights = self._solved(order, self.edges(order), exposures)
+        if lights is None:
             return
-        if p.warning:
-            self.stats.warn(p.warning)
-        self.graph.vignetting = p.vignetting
-        lights = dict(zip(order, p.lights))
-        if p.varies and not at_the_end:
+        self.graph.vignetting = self.photometry.vignetting
+        if self.photometry.varies and not at_the_end:
             lights = self._kept_still(lights)
         self._order, self._lights = order, lights
 
@@ -205,7 +155,7 @@ class Photometer:
         self._order = order
         for index in order if self.photometry.varies else ():
             if index not in self._lights:
-                self._attach(index)
+                self._attach_keyframe(index)
         if at_the_end and self._lights:
             mean = np.mean(list(self._lights.values()), axis=0)
             self._lights = {index: light - mean for index, light in self._lights.items()}
@@ -218,18 +168,9 @@ class Photometer:
         shift = np.mean([self._lights[i] - lights[i] for i in both], axis=0)
         return {index: light + shift for index, light in lights.items()}
 
-    def _attach(self, index: int) -> None:
+    def _attach_keyframe(self, index: int) -> None:
         """The light of a new keyframe, from those it was matched with."""
-        found: list[tuple[float, np.ndarray]] = []
-        for a, b in self.graph.edges.of([index]):
-            other, moments = b if a == index else a, self._moments[a, b][1]
-            if moments is not None and other in self._lights:
-                there = moments if b == index else backward(moments)
-                information = 1.0 / (self.photometry.edge_sigma[0] ** 2 + 1.0 / there[:, 0, 0].mean())
-                found.append((float(information), self._lights[other] + self.photometry.step(there)))
-        if found:
-            weights, lights = zip(*found)
-            self._lights[index] = np.asarray(np.average(lights, axis=0, weights=weights))
+        self._attach(index, ((pair, self._moments[pair][1]) for pair in self.graph.edges.of([index])))
 
     def _of_frame(self, record: Seen) -> np.ndarray | None:
         if record.index in self._lights:

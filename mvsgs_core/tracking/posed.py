@@ -13,10 +13,10 @@ from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.between import Between, exposure_from, spared
 from mvsgs_core.tracking.config import PosedConfig
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, reproject
-from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig, Step
+from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage, tracking_size
-from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, newest
+from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, Tail
 from mvsgs_core.tracking.local_map import LocalMap
 from mvsgs_core.tracking.matching.flow import Matches, make_flow
 from mvsgs_core.tracking.matching.matcher import Matcher
@@ -64,7 +64,8 @@ class PosedTracker:
         self.unit = 1.0  # of the given poses' units, one of the graph's
         self._undecided = True  # about the unit: no two keyframes have given a depth yet
         self._complete: list[int] = []  # keyframes not given out yet
-        self._tail: dict[int, tuple[TrackingImage, np.ndarray, Step]] = {}  # the last two frames since
+        self._tail = Tail()
+        self._poses: dict[int, np.ndarray] = {}  # (4, 4) of the frames since, in the graph's unit
         self._between: dict[int, dict[int, _Waiting]] = {}  # by the keyframe that they were followed from
 
     def add(
@@ -88,10 +89,12 @@ class PosedTracker:
             return self._insert(frame, pose, {}) if self._shows_another_place(frame, pose) else []
         self._lights[-1] = FrameLight(index, observed(self.graph, step.reference, frame, step.matches))
         if not self.choice.wants(index, step, frame.longer_side, self.config.keyframe_choice.max_flow):
-            if self._complete == [step.reference] and is_held_out(step.reference) and not is_held_out(index):
-                self.graph.remove(step.reference)  # the first frame of all: this one is as good
+            only = len(self.graph.keyframes) == 1
+            if only and is_held_out(step.reference) and not is_held_out(index):  # this one is as good
+                self.graph.remove(step.reference)
                 return self._first(frame, pose)
-            self._tail = {i: self._tail[i] for i in sorted(self._tail)[-1:]} | {index: (frame, pose, step)}
+            self._tail.add(frame, step)
+            self._poses[index] = pose
             self._wait(step.reference, _Waiting(frame.bare(), self._lights[-1], world_from_cam))
             return []
         return self._insert(frame, pose, {step.reference: step.matches})
@@ -99,7 +102,7 @@ class PosedTracker:
     @property
     def pending(self) -> set[int]:
         """Frames that may still be given out, as keyframes or between them."""
-        return set(self._complete).union(self._tail, *self._between.values())
+        return set(self._complete).union(self._tail.indices, *self._between.values())
 
     def between(self, keyframe: int) -> list[Between]:
         """Frames that were followed from this keyframe, once it is complete, in the unit of the given poses. Held-out
@@ -114,24 +117,20 @@ class PosedTracker:
     def finish(self) -> list[int]:
         """The stream has ended: the last keyframes, one of them of the last frames if they show something new."""
         complete: list[int] = []
-        tail = {i: t for i, t in self._tail.items() if self.choice.shows_new(t[2], t[0].longer_side)}
-        last = newest(tail)
-        if last is not None:
-            frame, pose, step = tail[last]
-            complete = self._insert(frame, pose, {step.reference: step.matches})
+        if last := self._tail.last(self.choice):
+            frame, step = last
+            complete = self._insert(frame, self._poses[frame.index], {step.reference: step.matches})
         self.photometer.update(at_the_end=True)
         self.stats.count(HELD_OUT, sum(is_held_out(index) for index in self.graph.keyframes))
-        complete, self._complete, self._tail = complete + self._complete, [], {}
+        complete, self._complete, self._tail = complete + self._complete, [], Tail()
         return complete
 
     def keyframe(self, index: int) -> Keyframe:
         """A keyframe in the unit of the given poses."""
         keyframe = self.graph.keyframes[index]
-        pose = keyframe.cam_from_world.copy()
-        pose[:3, 3] *= self.unit
         return replace(
             keyframe,
-            cam_from_world=pose,
+            cam_from_world=geometry.scaled(keyframe.cam_from_world, self.unit),
             inverse_depth=keyframe.inverse_depth / self.unit,
             information=keyframe.information * self.unit**2,
         )
@@ -184,7 +183,7 @@ class PosedTracker:
         if self._undecided:
             known = self.graph.keyframes[frame.index].triangulated
             self._undecided = bool(known.mean() <= DEPTHS * frame.cells.textured.mean())
-        complete, self._complete, self._tail = self._complete, [frame.index], {}
+        complete, self._complete, self._tail, self._poses = self._complete, [frame.index], Tail(), {}
         return complete
 
     def _first(self, frame: TrackingImage, pose: np.ndarray) -> list[int]:

@@ -12,7 +12,6 @@ which frames may come: they are followed from the keyframe before, and none of t
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.back_end import BackEnd
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.diagnosis import Diagnosis
-from mvsgs_core.tracking.estimation.calibration import Calibration
+from mvsgs_core.tracking.estimation.calibration import LAST, Calibration
 from mvsgs_core.tracking.frames import FrameRecord, record_of
 from mvsgs_core.tracking.front_end import FrontEnd, Step
 from mvsgs_core.tracking.graph import KeyframeGraph
@@ -62,7 +61,7 @@ class Session:
         self.intrinsics = scale_intrinsics(intrinsics, size, self.size)
         self.graph = KeyframeGraph(self.intrinsics, config.device)
         self.calibration = Calibration(
-            self.graph, config.focal, stats, float(intrinsics[0]), size, guessed,
+            self.graph, config.focal, stats, np.array(intrinsics, np.float64), guessed,
             config.readout_time, config.reads_columns, threads,
         )  # fmt: skip
         self.matcher = Matcher(make_flow(config.flow))
@@ -122,8 +121,10 @@ class Session:
         elif last := self._tail.last(self.choice):
             self.waiting.end()
             yield whole(self._add_keyframe(*last, record_of(self.records, last[0].index)))
+            if self.phase is Phase.INITIALIZING:  # it was none, and the first keyframe of a part that does not come
+                self.initializer.abandon()
         if largest := self.local_map.largest():
-            self.calibration.estimate_readout(largest[-40:])
+            self.calibration.estimate_readout(largest, LAST)
         if self.publisher.held:
             yield self._publish_held()
 
@@ -255,7 +256,7 @@ class Session:
 
     def _begin_tracking(self, keyframes: list[int], record: FrameRecord) -> Steps[Update]:
         """The first keyframes of a segment are solved; frames before and between them are matched at once."""
-        self.phase = Phase.TRACKING
+        self.phase, keyframes = Phase.TRACKING, [index for index in keyframes if index in self.graph.keyframes]
         yield
         yield from self.keyframe_work.first(keyframes)
         self.front_end.pose = self.graph.keyframes[keyframes[-1]].cam_from_world
@@ -347,8 +348,7 @@ class Session:
         if not self.relocalizer.hopeless:
             return Update(record.state)
         self.segment = 1 + max(self.publisher.highest_segment, *(k.segment for k in self.graph.keyframes.values()))
-        held = self._publish_held() if self.publisher.held else Update(record.state)
-        return replace(held, state=self._begin_segment(frame, record).state)
+        return self._begin_segment(frame, record)
 
     def _search_map(self, frame: TrackingImage) -> PlaceMatch | None:
         self.recovery.keep(frame)

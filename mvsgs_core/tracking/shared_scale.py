@@ -1,4 +1,4 @@
-"""Whether matches tie the distances between keyframes to each other.
+"""Whether matches tie keyframes to each other, and the distances between them.
 
 Two views tell the direction between them, not how far it is. How much longer one such distance is than another is told
 by points that are seen from both pairs alone: where each of a keyframe's points is found in one neighbor or the other,
@@ -34,4 +34,16 @@ def share_scale(graph: KeyframeGraph, keyframes: Sequence[int]) -> bool:
     return any(wanted <= frozenset().union(*group) for group in tied)
 
 
-__all__ = ["share_scale"]
+def tied_parts(graph: KeyframeGraph, keyframes: Sequence[int]) -> list[set[int]]:
+    """These keyframes in parts that no edge leads between; the last part has the newest of them."""
+    left, parts = set(keyframes), list[set[int]]()
+    while left:
+        part, found = set[int](), {max(left)}
+        while part != found:
+            part, found = found, graph.edges.reached(found) & left
+        parts.append(part)
+        left -= part
+    return parts[::-1]
+
+
+__all__ = ["share_scale", "tied_parts"]

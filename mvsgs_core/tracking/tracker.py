@@ -157,13 +157,19 @@ class Tracker:
         """Every frame's pose and exposure, after `finish`."""
         return self._trajectory
 
-    def begin(self, size: tuple[int, int], intrinsics: np.ndarray, guessed: bool = False) -> Session:
+    def begin(
+        self, size: tuple[int, int], intrinsics: np.ndarray, guessed: bool = False, original: np.ndarray | None = None
+    ) -> Session:
         """A stream of frames (height, width) with intrinsics (4,); the first frame does it, where nobody did before.
+
+        original: see `follow`.
 
         Raises ValueError for another camera than that of the map to go on in.
         """
         kind = FrozenSession if self._frozen else Session
         session = kind(self.config, self.stats, size, intrinsics, guessed)
+        if original is not None:
+            session.calibration.original = np.array(original, np.float64)
         if self._known is not None:
             with self.stats.time("taking up the map"):
                 go_on(session, self._known)
@@ -200,9 +206,10 @@ class Tracker:
         guessed: bool = False,
         exposure: float = 0.0,
         mask: np.ndarray | None = None,
+        original: np.ndarray | None = None,
     ) -> Update:
         """The next frame, and all that becomes of it, see `follow`."""
-        return self.follow(index, timestamp, image, intrinsics, guessed, exposure, mask).whole()
+        return self.follow(index, timestamp, image, intrinsics, guessed, exposure, mask, original).whole()
 
     def follow(
         self,
@@ -213,6 +220,7 @@ class Tracker:
         guessed: bool = False,
         exposure: float = 0.0,
         mask: np.ndarray | None = None,
+        original: np.ndarray | None = None,
     ) -> Update:
         """The next frame: (H, W, 3) uint8 RGB with its intrinsics (4,); indices must grow.
 
@@ -222,9 +230,11 @@ class Tracker:
         guessed: the focal length is to be estimated; keyframes are published when it is settled, see `focal_factor`.
         exposure: time times gain over the f-number squared, in a unit that the stream keeps; 0: not known.
         mask: (H, W) bool, False where a pixel is to be ignored; None: all count.
+        original: intrinsics (4,) of the image before its undistortion and scaling, in whose pixels focal lengths are
+        told; None: of this image.
         """
         size = image.shape[0], image.shape[1]
-        session = self._session or self.begin(size, intrinsics, guessed)
+        session = self._session or self.begin(size, intrinsics, guessed, original)
         if not np.allclose(scale_intrinsics(intrinsics, size, session.size), session.intrinsics, rtol=1e-3):
             self.stats.warn("the intrinsics change between frames: the tracker goes on with those of the first")
         with self.stats.time("image"):
@@ -259,7 +269,7 @@ class Tracker:
         exposure = session.photometer.of_frames(session.records, trajectory.posed)
         self._trajectory = replace(trajectory, exposure=exposure, vignetting=session.photometer.vignetting)
         stats.count("frames posed in the end", found)
-        stats.count(HELD_OUT, sum(is_held_out(index) for index in graph.keyframes if index >= 0))
+        stats.count(HELD_OUT, sum(is_held_out(index) for index in graph.keyframes))
         tell_what_moves(stats, graph)
         tracking = session.phase is not Phase.INITIALIZING
         if session.choice.spacing is not None and (spared := round(session.choice.spacing.spared)):

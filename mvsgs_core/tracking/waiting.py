@@ -48,7 +48,7 @@ class WaitingFrames:
         self._between.reopen()
 
     def forget(self) -> None:
-        """No keyframe comes that they could be seen from."""
+        """No keyframe comes that they could be seen from; those between keyframes that are held go on waiting."""
         self._between.forget()
         self._both_sides.forget()
 
@@ -62,7 +62,7 @@ class WaitingFrames:
             self._between.hold(len(publisher.held))
             return Settling(frozenset(), jobs, tuple, self._stats)
         frames = self._between.close()
-        last = partial(self._between.settle, frames, keyframes[-1], records, publisher.published)
+        last = partial(self._between.settle, frames, keyframes, records, publisher.published)
         return Settling(frames, jobs, last, self._stats)
 
 

@@ -79,8 +79,7 @@ def ring(
 def position_error(found: np.ndarray, true: np.ndarray) -> float:
     """Root mean square, over the length of the path, after alignment; poses (N, 4, 4) cam_from_world."""
     here, there = (geometry.inverse(poses)[:, :3, 3] for poses in (found, true))
-    scale, rotation, shift = geometry.umeyama(here, there)
-    off = scale * here @ rotation.T + shift - there
+    off = geometry.umeyama(here, there).apply(here) - there
     path = float(np.linalg.norm(np.diff(there, axis=0), axis=1).sum())
     return float(np.sqrt(np.mean(np.sum(off**2, axis=1)))) / path
 

@@ -44,6 +44,6 @@ def ate(trajectory: Trajectory, items: Sequence[Item], chosen: np.ndarray | None
     use = np.isfinite(trajectory.world_from_cam).all(axis=(1, 2)) & (True if chosen is None else chosen)
     found = trajectory.world_from_cam[use, :3, 3]
     wanted = np.stack([np.asarray(truth[int(n)])[:3, 3] for n in trajectory.index[use]])
-    s, r, t = geometry.umeyama(found, wanted)
+    aligned = geometry.umeyama(found, wanted).apply(found)
     length = float(np.linalg.norm(np.diff(wanted, axis=0), axis=1).sum())
-    return float(np.sqrt(np.mean(np.sum(np.square(s * found @ r.T + t - wanted), axis=1)))), length
+    return float(np.sqrt(np.mean(np.sum(np.square(aligned - wanted), axis=1)))), length

@@ -38,6 +38,13 @@ def image(number: int, index: int | None = None) -> TrackingImage:
     return TrackingImage.of(number if index is None else index, frame.timestamp, frame.image, (240, 320), False)
 
 
+def seen_at(time: float, index: int) -> tuple[TrackingImage, np.ndarray]:
+    """What the camera of the round sees between two frames, at a time in frames, and cam_from_world (4, 4) then."""
+    pose = _room().path.pose(time)
+    pixels, _ = _room().render(pose, item(0).intrinsics, (240, 320))
+    return TrackingImage.of(index, time / 20.0, pixels, (240, 320), False), geometry.inverse(pose)
+
+
 def true_pose(number: int, unit: float = 1.0) -> np.ndarray:
     """cam_from_world (4, 4). unit: meters that one length of the map is."""
     pose = geometry.inverse(np.asarray(item(number).world_from_cam))

@@ -20,7 +20,8 @@ BENT_LENS = "the lens bends, and the focal length makes up for it"
 UNKNOWN_LENS = "these images hardly tell a focal length from a lens that bends"
 FEW = 128  # keyframes, the first ones, that a given calibration is checked with
 MANY = 300  # keyframes, the first ones, that a guess is: their adjustment takes the square of their number in memory
-REESTIMATED_AT = (10, 20, 40)  # keyframes of the map at which the readout time is estimated again
+REESTIMATED_AT = (10, 20, 40)  # keyframes of a part of the map at which the readout time is estimated again, ...
+NEWEST, LAST = 12, 40  # ... from the newest ones, and in the end from so many
 
 
 @dataclass
@@ -30,8 +31,7 @@ class Calibration:
     graph: KeyframeGraph
     config: FocalConfig
     stats: Stats
-    pixels: float  # the focal length that came with the frames, at their own size ...
-    size: tuple[int, int]  # ... (height, width)
+    original: np.ndarray  # (4,) intrinsics of the original images, as they came: in their pixels focal lengths are told
     guessed: bool  # the focal length that came with the frames
     readout_time: float | None  # seconds; None: to be estimated
     reads_columns: bool  # where it is given
@@ -46,6 +46,7 @@ class Calibration:
         self.settled = not self.guessed
         self.of_map = False  # the focal length: of a map that is gone on with
         self.rolled = False  # a readout time that is not 0 was used before the one now, also by a map gone on with
+        self.readout_of = 0  # keyframes of the part that the readout time is of, `LAST` at most; 0: it is of none
 
     @property
     def settled(self) -> bool:
@@ -57,6 +58,11 @@ class Calibration:
         self.graph.weighing = settled
 
     @property
+    def pixels(self) -> float:
+        """The focal length that came with the frames, in pixels of the original images."""
+        return float(self.original[0])
+
+    @property
     def focal_factor(self) -> float:
         """On the focal length that came with the frames."""
         return float(self.graph.intrinsics[0] / self.given[0])
@@ -66,10 +72,14 @@ class Calibration:
         """How the focal length is found; None where it is known."""
         return None if self.settled else self.config
 
-    def refine(self, members: list[int]) -> None:
-        """With one more keyframe: the focal length again, until it is certain or has to do."""
+    def refine(self) -> None:
+        """With more keyframes: the focal length again, until it is certain or has to do.
+
+        It is that of all parts of the map together, none of which has gone out: one that was lost soon settles nothing.
+        """
         if self.settled:
             return
+        members = sorted(self.graph.keyframes)
         with self.stats.time("focal length"):
             failure = refine_focal(self.graph, members, self.threads)
             if failure:
@@ -93,7 +103,7 @@ class Calibration:
             return
         self.graph.intrinsics = self.given.copy()
         solver = Solver(steps=15, threads=self.threads)
-        solution = self.graph.optimize(members, set(members[1:]), set(members), solver)
+        solution = self.graph.optimize(members, self.graph.but_first(members), set(members), solver)
         if solution.failure:
             self.stats.count("failed bundle adjustments")
             self.stats.warn(f"poses and depths stay those of another focal length: {solution.failure}")
@@ -101,7 +111,7 @@ class Calibration:
         self.stats.values["focal_doubt"] = "it can't be told from these images, and the guess is kept"
         self.stats.warn(
             "the focal length can't be told from these images (a camera that hardly turns, or a flat scene): the guess "
-            f"is kept, {self._told(self.pixels)}, and the map may be stretched in depth; calibrate and set "
+            f"is kept, {_told(self.pixels)}, and the map may be stretched in depth; calibrate and set "
             "dataset.intrinsics=[fx,fy,cx,cy]"
         )
 
@@ -134,9 +144,8 @@ class Calibration:
         if abs(np.log(factor)) > max(self.config.drift, sigma):
             self.stats.values["focal_doubt"] = f"{who} want {factor:.4f} times as much"
             self.stats.warn(
-                f"{who} want a focal length of {self._told(factor * used)}, give or take "
-                f"{100 * sigma:.1f} %, and {used:.0f} px was used: run again with dataset.intrinsics=[fx,fy,cx,cy] set "
-                "to it"
+                f"{who} want a focal length of {_told(factor * used)}, give or take "
+                f"{100 * sigma:.1f} %, and {used:.0f} px was used: run again with {self._option(factor)}"
             )
 
     def _check_given(self, members: list[int]) -> None:
@@ -169,12 +178,12 @@ class Calibration:
                 "the given calibration",
                 "that were given",
                 "Is it of this camera at this size, and does the lens bend (dataset.distortion)? Or run again with "
-                "dataset.intrinsics=[fx,fy,cx,cy] as they want it",
+                f"{self._option(factor)}, as they want it",
             )
         )
         self.stats.warn(
             f"{what} and the images contradict each other: the keyframes want a focal length of "
-            f"{self._told(factor * used)}, {factor:.3f} times the {used:.0f} px {whose}, give or "
+            f"{_told(factor * used)}, {factor:.3f} times the {used:.0f} px {whose}, give or "
             f"take {100 * sigma:.1f} %; poses and map may be bent. {advice}"
         )
 
@@ -182,7 +191,7 @@ class Calibration:
         """Another focal length for all, or a lens that bends, would mend nothing."""
         before, after = (
             f"those of frames {part.frames[0]} to {part.frames[1]} want a focal length of "
-            f"{self._told(part.factor * self.focal_factor * self.pixels)}"
+            f"{_told(part.factor * self.focal_factor * self.pixels)}"
             for part in (zoom.before, zoom.after)
         )
         self.stats.values["focal_doubt"] = f"the camera zoomed, by about {zoom.factor:.1f}"
@@ -193,9 +202,10 @@ class Calibration:
             "the parts before and after it each by itself (dataset.start, dataset.stop)"
         )
 
-    def _told(self, focal: float) -> str:
-        """Pixels, and of what: frames may come smaller than they were taken."""
-        return f"{focal:.0f} px in images of {self.size[1]}x{self.size[0]}"
+    def _option(self, factor: float) -> str:
+        """For the next run. factor: on the focal lengths that were used."""
+        fx, fy, cx, cy = self.original * [factor * self.focal_factor, factor * self.focal_factor, 1.0, 1.0]
+        return f"dataset.intrinsics=[{fx:.1f},{fy:.1f},{cx:.1f},{cy:.1f}]"
 
     def _say_checked(self, factor: float, sigma: float) -> None:
         """factor: on what was used."""
@@ -203,20 +213,29 @@ class Calibration:
         self.stats.values["focal_checked_px"] = found
         self.stats.values["focal length, whole stream"] = f"{found:.1f} px, give or take {100 * sigma:.1f} %"
 
-    def estimate_readout(self, members: list[int]) -> None:
-        """Of a rolling shutter, from these keyframes."""
-        whole(self.estimating_readout(members))
+    def estimate_readout(self, members: list[int], newest: int = NEWEST) -> None:
+        """Of a rolling shutter, from the newest keyframes of a part of the map.
 
-    def estimating_readout(self, members: list[int]) -> Steps[None]:
+        Not from a part that has fewer keyframes than that which it was estimated from: the start of another one, of a
+        camera that was lost, tells less.
+        """
+        whole(self.estimating_readout(members, newest))
+
+    def estimating_readout(self, members: list[int], newest: int = NEWEST) -> Steps[None]:
         """`estimate_readout`, a time that is tried a step."""
-        if self.readout_time is not None:
+        if self.readout_time is not None or len(members) < self.readout_of:
             return
+        self.readout_of = min(len(members), LAST)
         self.rolled |= self.graph.readout_time != 0.0
-        estimating = estimating_readout(self.graph, members, self.threads)
+        estimating = estimating_readout(self.graph, members[-newest:], self.threads)
         found = yield from timed(self.stats, "rolling shutter", estimating)
         self.graph.readout_time, self.graph.reads_columns = found
         self.stats.values["readout_time"], self.stats.values["reads_columns"] = found
         self.stats.values["rolling shutter"] = told_readout_time(found[0], reads_columns=found[1])
+
+    def readout_due(self, members: int) -> bool:
+        """Whether a part of the map has so many keyframes now that the readout time is to be estimated again."""
+        return any(self.readout_of < number <= members for number in REESTIMATED_AT)
 
     def _sensible(self) -> bool:
         return self.config.bounds[0] < self.focal_factor < self.config.bounds[1]
@@ -243,12 +262,10 @@ class Calibration:
         elif float(np.hypot(alone, radial.error)) > self.config.doubt:
             self.stats.values["focal_doubt"] = BENT_LENS if radial.clear else UNKNOWN_LENS
         if radial.clear:
-            focal = used * radial.focal_factor
-            height, width = self.size
             self.stats.warn(
                 f"the lens bends: a radial distortion of {radial.k1:.3f}, give or take {radial.k1_sigma:.3f}, which is "
-                f"left in the images; run again with dataset.intrinsics=[{focal:.0f},{focal:.0f},cx,cy], of images of "
-                f"{width}x{height}, and dataset.distortion=[{radial.k1:.4f},0,0,0], which undistorts them"
+                f"left in the images; run again with {self._option(radial.focal_factor)} and "
+                f"dataset.distortion=[{radial.k1:.4f},0,0,0], which undistorts them"
             )
 
     def _report_radial(self, radial: Radial, alone: float) -> None:
@@ -263,4 +280,9 @@ class Calibration:
         )
 
 
-__all__ = ["REESTIMATED_AT", "Calibration"]
+def _told(focal: float) -> str:
+    """Pixels, and of what: frames may come smaller than they were taken."""
+    return f"{focal:.0f} px in the original images"
+
+
+__all__ = ["LAST", "Calibration"]

@@ -85,13 +85,13 @@ def _with_intrinsics(
 def refine_focal(graph: KeyframeGraph, members: list[int], threads: int) -> str:
     """Bundle adjustment of these keyframes with the focal length; returns why it failed, or nothing."""
     solver = Solver(steps=15, robust_scale=1.0, tolerance=1e-4, threads=threads)
-    return graph.optimize(members, set(members[1:]), set(members), solver, free_focal=True).failure
+    return graph.optimize(members, graph.but_first(members), set(members), solver, free_focal=True).failure
 
 
 def observability(graph: KeyframeGraph, members: list[int], probe: float, threads: int, factor: float = 1.0) -> float:
     """Fraction by which the cost rises where the focal length is wrong by `probe`, the rest adjusted to it; the graph
     stays as it is. The lesser of both directions. factor: on the graph's focal length, what is taken for right."""
-    problem = graph.problem(members, set(members[1:]), set(members))
+    problem = graph.problem(members, graph.but_first(members), set(members))
     problem.intrinsics = problem.intrinsics * [factor, factor, 1.0, 1.0]
     solver = Solver(steps=10, robust_scale=1.0, tolerance=1e-4, threads=threads)
     here = adjust(problem, solver)
@@ -107,7 +107,7 @@ def observability(graph: KeyframeGraph, members: list[int], probe: float, thread
 
 def focal_of_all(graph: KeyframeGraph, members: list[int], threads: int, steps: int = 10) -> float | None:
     """Factor on the focal length that all these keyframes would rather have; None where they can't tell."""
-    problem = replace(graph.problem(members, set(members[1:]), set(members)), free_focal=True)
+    problem = replace(graph.problem(members, graph.but_first(members), set(members)), free_focal=True)
     solution = adjust(problem, Solver(steps=steps, robust_scale=1.0, tolerance=1e-4, threads=threads))
     return None if solution.failure else solution.focal_factor
 

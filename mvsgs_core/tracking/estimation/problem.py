@@ -6,7 +6,7 @@ residual of a cell is r = target - project(T_ij [x, y, 1, d]), T_ij = T_j T_i^-1
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -20,7 +20,7 @@ class Solver:
     adaptive: bool = True  # Levenberg-Marquardt; False: plain Gauss-Newton, every step taken
     lm: float = 1e-4  # fraction of the diagonal added to it, after the Schur complement
     ep: float = 1e-6  # added to the diagonal, after the Schur complement
-    robust: Literal["none", "huber", "cauchy"] = "cauchy"
+    robust: Literal["none", "cauchy"] = "cauchy"
     robust_scale: float = 1.0  # whitened pixels
     min_z: float = 0.05  # scaled depth in the target keyframe below which a cell has no weight
     min_inverse_depth: float = 1e-3  # per unit of the map
@@ -108,10 +108,6 @@ class Solution:
     steps: int  # accepted
     smallest_pivot: float  # of the last factorization, relative: near 0 is ill-conditioned
     failure: str = ""
-    ill_conditioned: bool = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "ill_conditioned", bool(self.smallest_pivot < 1e-7))
 
 
 __all__ = ["DROID_GLOBAL", "DROID_LOCAL", "Graph", "Solution", "Solver"]

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mvsgs_core import camera
 from mvsgs_core.tracking.estimation.bundle_adjustment import Graph, Solution, Solver, adjust
 from mvsgs_core.tracking.graph import KeyframeGraph
 
@@ -54,7 +55,7 @@ def lens_problem(graph: KeyframeGraph, members: Sequence[int]) -> Graph:
     Beyond its border they see the border repeated, which holds matches back, by 0.08 pixels on the synthetic room, in
     the very part of the image that tells most of the lens.
     """
-    problem = graph.problem(members, set(members[1:]), set(members))
+    problem = graph.problem(members, graph.but_first(members), set(members))
     height, width = graph.keyframes[members[0]].image.size
     inside = _inside(problem.pixels, height, width)[problem.source] & _inside(problem.target, height, width)
     return replace(problem, information=problem.information * inside[:, None])
@@ -146,11 +147,7 @@ def _rays(at: np.ndarray, intrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def _straight(at: np.ndarray, intrinsics: np.ndarray, k1: float) -> np.ndarray:
     """Where pixels (N, 2, M) would be without distortion."""
     fx, fy, cx, cy = intrinsics
-    seen_x, seen_y = _rays(at, intrinsics)
-    x, y = seen_x, seen_y
-    for _ in range(10):
-        bent = np.maximum(1.0 + k1 * (x * x + y * y), 0.1)
-        x, y = seen_x / bent, seen_y / bent
+    x, y = camera.straightened(*_rays(at, intrinsics), k1)
     return np.stack([fx * x + cx, fy * y + cy], axis=1)
 
 

@@ -17,11 +17,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from mvsgs_core.camera import MAX_READOUT_TIME, is_readout_time
+from mvsgs_core.camera import MAX_READOUT_TIME, is_readout_time, pixel_motion
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, adjust
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
-from mvsgs_core.tracking.steps import Steps, whole
+from mvsgs_core.tracking.steps import Steps
 
 MAX_ESTIMATED = 0.035  # seconds: most cameras need less than a frame at 30 a second
 TRIED = 4  # times of one direction, 0 among them
@@ -37,16 +37,11 @@ class Readout(NamedTuple):
     reads_columns: bool  # not rows
 
 
-def estimate_readout(graph: KeyframeGraph, indices: Iterable[int], threads: int) -> Readout:
-    """0 s for a global shutter or where the matches hardly tell. Leaves the graph as it is.
-
-    The graph's own readout where nothing can be said: an adjustment failed, or the cost has no least.
-    """
-    return whole(estimating_readout(graph, indices, threads))
-
-
 def estimating_readout(graph: KeyframeGraph, indices: Iterable[int], threads: int) -> Steps[Readout]:
-    """`estimate_readout`, a time that is tried a step; the graph is as it was between them, too.
+    """0 s for a global shutter or where the matches hardly tell; a time that is tried a step.
+
+    The graph's own readout where nothing can be said: an adjustment failed, or the cost has no least. The graph is left
+    as it is, and is so between the steps, too.
 
     The shortest time is tried of all four directions, and longer ones of that of which it leaves the least cost: along
     the wrong axis a rolling shutter gains a little, too, but never as much.
@@ -110,11 +105,8 @@ def camera_velocity(keyframe: Keyframe, intrinsics: np.ndarray) -> np.ndarray | 
         return None
     fx, fy, cx, cy = intrinsics
     x, y = ((keyframe.points[known] - [cx, cy]) / [fx, fy]).T
-    near, zero = keyframe.inverse_depth[known], np.zeros(int(known.sum()))
-    # how the image moves with the camera: the interaction matrix of visual servoing (Chaumette and Hutchinson 2006)
-    of_u = np.stack([-near, zero, x * near, x * y, -(1.0 + x * x), y], axis=1) * fx
-    of_v = np.stack([zero, -near, y * near, 1.0 + y * y, -x * y, -x], axis=1) * fy
-    moves = np.stack([of_u, of_v], axis=1)  # (M, 2, 6)
+    of_each = pixel_motion(x, y, keyframe.inverse_depth[known], intrinsics)
+    moves = np.ascontiguousarray(np.stack(of_each).transpose(2, 0, 1))  # (M, 2, 6)
     seen = flow.reshape(-1, 2)[known].astype(np.float64)
     weight = np.ones(len(seen))
     for _ in range(VELOCITY_STEPS):
@@ -178,7 +170,6 @@ __all__ = [
     "Readout",
     "camera_velocity",
     "check_readout_time",
-    "estimate_readout",
     "estimating_readout",
     "rectified",
     "rectified_mask",

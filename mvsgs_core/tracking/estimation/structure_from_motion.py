@@ -17,7 +17,7 @@ from mvsgs_core.tracking.estimation.bundle_adjustment import Graph, Solution, So
 from mvsgs_core.tracking.estimation.static_points import STILL, static_weights
 from mvsgs_core.tracking.estimation.two_view_starts import two_view_poses, widest_pairs
 from mvsgs_core.tracking.graph import KeyframeGraph
-from mvsgs_core.tracking.steps import Steps, whole
+from mvsgs_core.tracking.steps import Steps
 
 PAIRS = 4  # of keyframes that poses are taken from ...
 EPIPOLAR = (0.3, 1.0)  # ... by the matches that are so many pixels from their epipolar lines
@@ -50,17 +50,13 @@ class Reconstruction:
     focal_factor: float = 1.0  # on the graph's focal length, where it was free
 
 
-def reconstruct(
-    graph: KeyframeGraph, order: list[int], criteria: ReconstructionCriteria, threads: int, free_focal: bool = False
-) -> Reconstruction:
-    """Solves keyframes `order` of the graph, without changing it. free_focal: the focal length is unknown too."""
-    return whole(reconstructing(graph, order, criteria, threads, free_focal))
-
-
 def reconstructing(
     graph: KeyframeGraph, order: list[int], criteria: ReconstructionCriteria, threads: int, free_focal: bool = False
 ) -> Steps[Reconstruction]:
-    """`reconstruct`, a bundle adjustment a step."""
+    """Solves keyframes `order` of the graph, without changing it, a bundle adjustment a step.
+
+    free_focal: the focal length is unknown too.
+    """
     everything = set(order)
     problem = graph.problem(order, everything - {order[0]}, everything)
     k, m = problem.inverse_depth.shape
@@ -85,8 +81,7 @@ def reconstructing(
     poses, depths = best.cam_from_world, best.inverse_depth
     known = best.information * depths**2 > 10.0
     scale = float(np.median(depths[known])) if known.sum() > 50 else float(np.median(depths))
-    poses = poses.copy()
-    poses[:, :3, 3] *= scale
+    poses = geometry.scaled(poses, scale)
     depths = depths / scale
     centers = geometry.inverse(poses)[:, :3, 3]
     baseline = float(np.max(np.linalg.norm(centers[:, None] - centers[None], axis=-1)))
@@ -237,4 +232,4 @@ def _largest_median(distance: np.ndarray, seen: np.ndarray) -> float:
     return max((float(np.median(d[s])) for d, s in zip(distance, seen) if s.sum() > 30), default=0.0)
 
 
-__all__ = ["Reconstruction", "ReconstructionCriteria", "reconstruct", "reconstructing"]
+__all__ = ["Reconstruction", "ReconstructionCriteria", "reconstructing"]

@@ -163,13 +163,10 @@ class _Adjuster:
         """Costs and the weights of iteratively reweighted least squares, each (E, M)."""
         ru, rv = residual[:, 0], residual[:, 1]
         s2 = weights[0] * ru * ru + 2.0 * weights[1] * ru * rv + weights[2] * rv * rv
-        scale, k2 = self.solver.robust_scale, self.solver.robust_scale**2
+        k2 = self.solver.robust_scale**2
         if self.solver.robust == "cauchy":
             g = 1.0 + s2 / k2
             return k2 * torch.log(g.clamp(max=1e15)), 1.0 / g
-        if self.solver.robust == "huber":
-            s = s2.clamp(min=k2).sqrt()
-            return torch.where(s2 <= k2, s2, 2.0 * scale * s - k2), torch.where(s2 <= k2, 1.0, scale / s)
         return s2, torch.ones_like(s2)
 
     def _cost(self, state: _State) -> float:

@@ -173,7 +173,7 @@ FLOWS = {
     "lucas_kanade": "mvsgs_core.tracking.matching.flow:LucasKanade",
     "dis": "mvsgs_core.tracking.matching.flow:refined_inverse_search",
     "features": "mvsgs_core.tracking.matching.flow:refined_features",
-    "raft_small": "mvsgs_core.tracking.matching.raft_flow:RefinedRaftFlow",
+    "raft_small": "mvsgs_core.tracking.matching.raft_flow:refined_raft",
 }
 
 

@@ -1,12 +1,12 @@
-"""RAFT-small as a flow of the tracker (mvsgs_core.tracking.matching.flow), by itself or refined to subpixels.
+"""RAFT-small as a flow of the tracker (mvsgs_core.tracking.matching.flow): `flow: raft_small`, refined to subpixels.
 
-`flow: mvsgs_core.tracking.matching.raft_flow:RefinedRaftFlow`. RAFT alone solves at 1/8 and interpolates: its matches
-are some tenths of a pixel off, which costs accuracy; it is there for motion and blur that Lucas-Kanade does not follow.
+RAFT solves at 1/8 and interpolates: its matches are some tenths of a pixel off, which costs accuracy; it is there for
+motion and blur that Lucas-Kanade does not follow.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
@@ -17,12 +17,12 @@ from mvsgs_core import weights
 from mvsgs_core.networks import checkpoints
 from mvsgs_core.networks.raft_small import STRIDE, RaftSmall
 from mvsgs_core.tracking.image import TrackingImage
-from mvsgs_core.tracking.matching.flow import LucasKanade, Matches
+from mvsgs_core.tracking.matching.flow import LucasKanade, Matches, RefinedFlow
 
 
 @dataclass
 class RaftFlow:
-    """Dense flow there and back, begun from the guess; the weight falls with the distance from where it came.
+    """Dense flow, begun from the guess; weights are all 1, also of points that leave the image.
 
     Raises FileNotFoundError where the weights are missing, saying what to fetch from where.
     """
@@ -30,11 +30,8 @@ class RaftFlow:
     weights: str | None = None  # file; None: found by the registry
     iterations: int = 8  # of the recurrent update
     guided: bool = True  # the search begins at the guess that the tracker has
-    distance_sigma: float = 0.7  # pixels there and back at which the weight has fallen to 0.6
-    max_distance: float = 2.0  # pixels there and back
     device: str = "cpu"
     needs_color: bool = True
-    calls: int = field(default=0, repr=False)  # pairs of images
 
     def __post_init__(self) -> None:
         self._file = weights.find("raft_small", self.weights)
@@ -45,58 +42,28 @@ class RaftFlow:
         checkpoints.load_registered(net, "raft_small", self._file)
         return net.to(self.device)
 
-    def field(self, a: TrackingImage, b: TrackingImage, start: np.ndarray | None, back: bool) -> np.ndarray:
-        """Flow (1, 2, H, W) float32 in pixels from a to b; with `back` (2, 2, H, W), the second from b to a.
+    def field(self, a: TrackingImage, b: TrackingImage, start: np.ndarray | None) -> np.ndarray:
+        """Flow (2, H, W) float32 in pixels from a to b.
 
-        start: (2, H / 8, W / 8) flow from a to b to begin with, in pixels of the 1/8 map.
+        start: (2, H / 8, W / 8) flow to begin with, in pixels of the 1/8 map; None: nothing is known.
         """
-        self.calls += 1
-        first = torch.from_numpy(np.stack([_color(a), _color(b)])).permute(0, 3, 1, 2).float().to(self.device)
-        second = first.flip(0)
-        begin = None
-        if start is not None:
-            # on the way back the same motion, at nearly the same place: a start, no more
-            begin = torch.from_numpy(np.stack([start, -start]).astype(np.float32)).to(self.device)
-        if not back:
-            first, second, begin = first[:1], second[:1], None if begin is None else begin[:1]
-        flow: np.ndarray = self._net(first, second, self.iterations, begin).cpu().numpy()
+        images = torch.from_numpy(np.stack([_color(a), _color(b)])).permute(0, 3, 1, 2).float().to(self.device)
+        begin = None if start is None else torch.from_numpy(start.astype(np.float32)).to(self.device)[None]
+        flow: np.ndarray = self._net(images[:1], images[1:], self.iterations, begin).cpu().numpy()[0]
         return flow
 
-    def start(self, a: TrackingImage, points: np.ndarray, guess: np.ndarray) -> np.ndarray | None:
-        """What the search begins with, (2, H / 8, W / 8); None: nothing."""
-        if not self.guided:
-            return None
-        return _coarse_field(points, guess - points, (a.size[0] // STRIDE, a.size[1] // STRIDE))
-
     def match(self, a: TrackingImage, b: TrackingImage, points: np.ndarray, guess: np.ndarray) -> Matches:
-        """Points of a (N, 2) in b; a point is lost where the way back leads elsewhere or it leaves the image."""
-        height, width = b.size
-        there, back = self.field(a, b, self.start(a, points, guess), back=True)
+        grid = a.size[0] // STRIDE, a.size[1] // STRIDE
+        start = _coarse_field(points, guess - points, grid) if self.guided else None
         at = np.asarray(points, dtype=np.float64)
-        target = at + _sample(there, at)
-        inside = np.all((target >= 0) & (target <= [width - 1, height - 1]), axis=1) & np.isfinite(target).all(axis=1)
-        landing = np.where(inside[:, None], target, 0.0)
-        distance = np.linalg.norm(landing + _sample(back, landing) - at, axis=1)
-        alive = inside & (distance < self.max_distance)
-        weight = np.where(alive, np.exp(-0.5 * np.square(np.where(alive, distance, 0.0) / self.distance_sigma)), 0.0)
-        return Matches(np.where(alive[:, None], target, np.nan), weight)
+        return Matches(at + _sample(self.field(a, b, start), at), np.ones(len(at)))
 
 
-@dataclass
-class RefinedRaftFlow(RaftFlow):
-    """RAFT one way finds the points, Lucas-Kanade at full size refines and verifies them."""
-
-    threads: int = 1  # of the refinement
-
-    @cached_property
-    def _refinement(self) -> LucasKanade:
-        return LucasKanade(start_level=0, threads=self.threads)
-
-    def match(self, a: TrackingImage, b: TrackingImage, points: np.ndarray, guess: np.ndarray) -> Matches:
-        """Points of a (N, 2) in b; a point is lost where Lucas-Kanade does not confirm it."""
-        (flow,) = self.field(a, b, self.start(a, points, guess), back=False)
-        at = np.asarray(points, dtype=np.float64)
-        return self._refinement.match(a, b, points, at + _sample(flow, at))
+def refined_raft(
+    weights: str | None = None, iterations: int = 8, guided: bool = True, device: str = "cpu", threads: int = 1
+) -> RefinedFlow:
+    """RAFT is off by tenths of a pixel: refined at full size. threads: of the refinement; the rest as `RaftFlow`."""
+    return RefinedFlow(RaftFlow(weights, iterations, guided, device), LucasKanade(start_level=0, threads=threads))
 
 
 def _color(image: TrackingImage) -> np.ndarray:
@@ -128,4 +95,4 @@ def _coarse_field(points: np.ndarray, moved: np.ndarray, grid: tuple[int, int]) 
     return np.stack(means).reshape(2, rows, columns) / STRIDE
 
 
-__all__ = ["RaftFlow", "RefinedRaftFlow"]
+__all__ = ["RaftFlow", "refined_raft"]

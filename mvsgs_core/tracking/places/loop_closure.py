@@ -14,7 +14,7 @@ from mvsgs_core.tracking.places.geometric_verification import PlaceMatch, relati
 from mvsgs_core.tracking.places.pose_criteria import PoseCriteria
 from mvsgs_core.tracking.places.retrieval import Retrieval
 from mvsgs_core.tracking.places.thinning import UNMATCHED, joining, solve_thinned
-from mvsgs_core.tracking.steps import Steps, whole
+from mvsgs_core.tracking.steps import Steps
 
 
 @dataclass(frozen=True)
@@ -47,15 +47,12 @@ class LoopCloser:
         """A keyframe that may be found again."""
         self.retrieval.add(index, self.graph.keyframes[index].image.features()[1])
 
-    def search(self, index: int) -> Closure | None:
-        """Looks for old keyframes in the image of this one; the first that verifies is used.
+    def searching(self, index: int) -> Steps[Closure | None]:
+        """Looks for old keyframes in the image of this one, a part of a candidate's verification a step; the first that
+        verifies is used.
 
         What is near, in time or by at most two edges, is no loop.
         """
-        return whole(self.searching(index))
-
-    def searching(self, index: int) -> Steps[Closure | None]:
-        """`search`, a part of a candidate's verification a step."""
         keyframe = self.graph.keyframes[index]
         order = self.local_map.members(keyframe.segment)
         place = order.index(index)

@@ -62,21 +62,21 @@ class Recovery:
 
     def _follow(self, start: int, run: Iterable[FrameRecord]) -> Steps[int]:
         """One run of frames without a pose, from the keyframe at its side; returns how many were found."""
-        follower = FrontEnd(self.graph, self.matcher, self.front_end, 1)
-        follower.refer_to(self.graph.keyframes[start].image)
+        follower, reference = FrontEnd(self.graph, self.matcher, self.front_end, 1), self.graph.keyframes[start].image
+        follower.refer_to(reference)
         found = 0
         for record in run:
             image = self._images.get(record.index)
             if image is None:
                 continue
             step = follower.follow(image, with_pose=True)
-            if follower.is_lost(step) or step.localization is None:
-                continue
-            if self.config.criteria.accept(self.graph, start, step.matches, step.localization):
-                record.follow(self.graph, start, step.matches, step.localization.cam_from_world, image)
+            pose = None if follower.is_lost(step) else step.localization
+            if pose is not None and self.config.criteria.accept(self.graph, start, step.matches, pose):
+                record.follow(self.graph, start, step.matches, pose.cam_from_world, image)
                 found += 1
             image.release()
             yield
+        reference.release()
         return found
 
     def _has_pose(self, record: FrameRecord) -> bool:

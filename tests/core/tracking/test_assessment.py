@@ -33,7 +33,7 @@ def test_small_images_do_not_bend_the_map() -> None:
     error, length = ate(trajectory, items)
     assert error < 0.0025 * length
     true = np.stack([np.asarray(i.world_from_cam)[:3, 3] for i in items])
-    scale, _, _ = geometry.umeyama(trajectory.world_from_cam[:, :3, 3], true)
+    scale = geometry.umeyama(trajectory.world_from_cam[:, :3, 3], true).scale
     ratios = []
     for index in trajectory.index[trajectory.keyframe]:
         keyframe, depth = tracker.keyframe(int(index)), items[int(index)].depth

@@ -15,6 +15,7 @@ from mvsgs_core.tracking.edges import Edge
 from mvsgs_core.tracking.estimation.bundle_adjustment import adjust
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.local_map import LocalMap, LocalMapConfig
+from mvsgs_core.tracking.steps import whole
 from tests.support.true_maps import exact_matches, matcher, pose_error, true_graph, true_pose
 
 FRAMES = (0, 6, 12, 18)
@@ -114,27 +115,27 @@ def test_background_work_is_a_step_a_time_while_some_is_left() -> None:
     graph = disturbed()
     made = back_end(graph)
     before, scale, poses = worst_pose(graph), median_inverse_depth(graph), graph.keyframes[6].cam_from_world
-    made.work(0)
+    whole(made.working(0))
     np.testing.assert_array_equal(graph.keyframes[6].cam_from_world, poses, "nothing is left to do")
     made.pending = 3
     for left in (2, 1, 0):
-        made.work(0)
+        whole(made.working(0))
         assert made.pending == left
     assert worst_pose(graph) < 0.5 * before
     assert median_inverse_depth(graph) == pytest.approx(scale, rel=1e-6)
     poses = graph.keyframes[6].cam_from_world
-    made.work(0)
+    whole(made.working(0))
     np.testing.assert_array_equal(graph.keyframes[6].cam_from_world, poses)
 
 
 def test_background_work_that_fails_says_why_and_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     made = back_end(connected())
     made.pending = 3
-    assert made.work(0) == ""
+    assert whole(made.working(0)) == ""
     monkeypatch.setattr(keyframe_graph, "adjust", lambda *given: replace(adjust(*given), failure="no step"))
-    assert made.work(0) == "no step"
+    assert whole(made.working(0)) == "no step"
     assert made.pending == 0
-    assert made.work(0) == "", "nothing is left to do"
+    assert whole(made.working(0)) == "", "nothing is left to do"
 
 
 def test_the_end_matches_again_adds_edges_and_adjusts() -> None:

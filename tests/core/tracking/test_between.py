@@ -85,6 +85,8 @@ def test_few_frames_wait_with_keyframes_that_wait_themselves_spread_evenly() -> 
     kept = sorted(between.waiting)
     assert len(kept) == 2 * HELD
     assert max(np.diff([0, *kept, 20])) <= 8
+    between.forget()
+    assert sorted(between.waiting) == kept, "another part of the map begins"
     come(between, 21)
     between.reopen()
     assert between.waiting == {*kept, 21}, "the keyframes are solved"

@@ -102,7 +102,7 @@ def test_a_step_is_the_one_of_numerical_jacobians(focal: bool) -> None:
     np.testing.assert_allclose(np.log(solution.focal_factor), expected[6], atol=2e-6)
 
 
-@pytest.mark.parametrize("robust", ["none", "huber", "cauchy"])
+@pytest.mark.parametrize("robust", ["none", "cauchy"])
 def test_finds_the_true_scene(robust: str) -> None:
     graph, poses, inverse_depth = scene(k=5, m=80)
     start = replace(moved(graph, 2, 0.01, 0.05), free_pose=np.arange(5) > 1)  # two poses: the gauge with its scale
@@ -158,8 +158,8 @@ def test_a_free_scale_is_ill_conditioned() -> None:
     held = adjust(
         replace(graph, free_pose=np.arange(3) > 1), Solver(steps=1, adaptive=False, lm=0.0, ep=0.0, robust="none")
     )
-    assert free.ill_conditioned or free.failure
-    assert not held.ill_conditioned
+    assert free.smallest_pivot < 1e-7 or free.failure
+    assert held.smallest_pivot > 1e-7
 
 
 @pytest.mark.parametrize("threads", [1, 2])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -32,9 +33,10 @@ def room(focal: float) -> tuple[Item, ...]:
 
 
 @functools.cache
-def straight() -> tuple[Item, ...]:
+def straight(focal: float = 0.8) -> tuple[Item, ...]:
     """A camera that never turns: depths of any scale along the axis go with some focal length."""
     sequence = Synthetic(frames=2, size=SIZE, threads=1)
+    sequence.intrinsics = sequence.intrinsics * [focal / 0.8, focal / 0.8, 1.0, 1.0]
     items = []
     for n in range(45):
         pose = np.array(sequence[0].world_from_cam)
@@ -48,6 +50,27 @@ def track_guessing(items: tuple[Item, ...]) -> tuple[Tracker, Trajectory, list[U
     updates = [tracker.add(i.index, i.timestamp, i.image, GUESS, guessed=True) for i in items]
     updates += tracker.finish()
     return tracker, tracker.trajectory(), updates
+
+
+def lost_soon(again: int) -> tuple[Tracker, list[int], list[Item]]:
+    """Six keyframes of a camera that does not turn, six frames of elsewhere, and so many of one that does, in the same
+    room, which is not recognized.
+
+    The tracker, the keyframes of the first part, and the frames of both.
+    """
+    tracker, seen, first = Tracker(TrackerConfig(loops=False)), list[Item](), list[int]()
+    while len(first) < 6:
+        seen.append(straight(1.3)[len(seen)])
+        item = seen[-1]
+        assert tracker.add(item.index, item.timestamp, item.image, GUESS, guessed=True).keyframes == ()
+        first = list(tracker.session.publisher.held if tracker.phase is Phase.TRACKING else ())
+    tracker.session.relocalizer.relocalize = lambda frame: None  # type: ignore[method-assign]
+    elsewhere = [replace(item, world_from_cam=None) for item in synthetic(frames=40, scene="aerial")[:6]]
+    for item in [*elsewhere, *room(1.3)[:again]]:
+        item = replace(item, index=len(seen), timestamp=len(seen) / 20.0)
+        tracker.add(item.index, item.timestamp, item.image, GUESS, guessed=True)
+        seen.append(item)
+    return tracker, first, seen
 
 
 @pytest.mark.parametrize("focal", [0.5, 1.3])  # fields of view of 90 and 42 degrees; the guess is 65
@@ -101,12 +124,41 @@ def test_frames_between_keyframes_that_waited_to_the_end_of_their_part_go_out_wi
     held, updates = list(tracker.session.publisher.held), list[Update]()
     for n, other in enumerate(synthetic(frames=40, scene="aerial")[:6] if lost else (), item.index + 1):
         updates.append(tracker.add(n, n / 20.0, other.image, GUESS, guessed=True))
-    (update,) = [update for update in [*updates, *tracker.finish()] if update.keyframes]
+    assert (tracker.phase is Phase.INITIALIZING) == lost, "another part begins"
+    assert not any(update.keyframes for update in updates), "it may tell the focal length"
+    (update,) = [update for update in tracker.finish() if update.keyframes]
     assert update.keyframes == tuple(held)
-    assert not lost or update is updates[-1], "another part begins"
     between = [frame.index for frame in update.between]
     for before, after in pairwise(held):
         assert any(before < index < after for index in between)
+
+
+def test_a_camera_that_is_lost_soon_gets_the_focal_length_of_all_parts() -> None:
+    tracker, first, seen = lost_soon(60)
+    assert tracker.session.calibration.settled
+    assert tracker.focal_factor == pytest.approx(1.3 * SIZE[1] / GUESS[0], rel=0.02)
+    list(tracker.finish())
+    trajectory = tracker.trajectory()
+    for segment in (0, 1):
+        here = trajectory.segment == segment
+        error, length = ate(trajectory, seen, here)
+        assert error < 0.004 * length
+    assert set(first) == set(trajectory.index[trajectory.keyframe & (trajectory.segment == 0)])
+
+
+def test_keyframes_of_a_part_that_was_lost_soon_go_out_when_the_next_one_tells_the_focal_length() -> None:
+    tracker, first, _ = lost_soon(0)
+    held, between = tracker.session.publisher.held, tracker.session.waiting.indices
+    assert held == first
+    assert between, "frames between them wait, too"
+    for n, item in enumerate(room(1.3), len(tracker.session.records)):
+        update = tracker.add(n, n / 20.0, item.image, GUESS, guessed=True)
+        if update.keyframes:
+            break
+        assert tracker.pending >= between.union(first)
+    assert list(update.keyframes[:6]) == first
+    assert {tracker.keyframe(index).segment for index in update.keyframes} == {0, 1}
+    assert {frame.keyframe in first for frame in update.between} == {False, True}
 
 
 def test_a_camera_that_never_turns_keeps_the_guess_and_says_so() -> None:
@@ -128,7 +180,7 @@ def test_a_known_focal_length_is_left_alone_and_a_wrong_one_is_said(off: float, 
     if said:
         assert tracker.stats.values["focal_checked_px"] == pytest.approx(true, rel=0.015)
         (warning,) = [w for w in tracker.stats.warnings if "contradict" in w]
-        assert f"px in images of {SIZE[1]}x{SIZE[0]}, " in warning
+        assert "px in the original images, " in warning
         assert f"times the {off * true:.0f} px that were given" in warning
         assert "dataset.intrinsics" in warning
     else:

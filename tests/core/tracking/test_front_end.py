@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,7 +14,17 @@ from mvsgs_core.datasets.synthetic import Synthetic
 from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
-from tests.support.true_maps import exact_matches, image, item, matcher, pose_error, shuffled, true_graph, true_pose
+from tests.support.true_maps import (
+    exact_matches,
+    image,
+    item,
+    matcher,
+    pose_error,
+    seen_at,
+    shuffled,
+    true_graph,
+    true_pose,
+)
 
 SLIT = slice(107, 213)  # columns of an image: a third
 
@@ -69,6 +80,30 @@ def test_a_camera_that_rests_is_seen_to() -> None:
     assert again.matches is first.matches
     np.testing.assert_array_equal(again.pose, first.pose)
     assert made.follow(image(2, index=4), with_pose=False).localization is None
+
+
+def test_a_slow_camera_has_a_pose_of_its_own_in_every_frame() -> None:
+    """As of the frame before, poses would be a staircase."""
+    made, before = front_end(0), true_pose(0)
+    for index in range(1, 9):
+        frame, true = seen_at(0.04 * index, index)
+        step = made.follow(frame, with_pose=True)
+        assert not step.still, index
+        moved = pose_error(before, true)[0]
+        assert pose_error(step.pose, true)[0] < 0.5 * moved
+        assert step.flow < index * 0.001 * frame.longer_side
+        before = true
+
+
+def test_the_noise_of_a_sensor_is_no_motion() -> None:
+    """Nor what a camera makes of it that compresses its images."""
+    made, random = front_end(0), np.random.default_rng(0)
+    made.follow(image(2), with_pose=True)
+    for index in range(3, 9):
+        noisy = np.clip(item(2).image + random.normal(0.0, 4.0, (240, 320, 3)), 0, 255).astype(np.uint8)
+        _, packed = cv2.imencode(".jpg", noisy, [cv2.IMWRITE_JPEG_QUALITY, 80])
+        frame = TrackingImage.of(index, index / 20.0, cv2.imdecode(packed, cv2.IMREAD_COLOR), (240, 320), False)
+        assert made.follow(frame, with_pose=True).still
 
 
 def test_a_light_that_is_switched_on_is_no_rest() -> None:

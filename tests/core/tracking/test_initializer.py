@@ -12,7 +12,7 @@ from mvsgs_core.tracking.diagnosis import Diagnosis
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.initializer import InitializationConfig, Initializer
-from mvsgs_core.tracking.matching.flow import Matches
+from mvsgs_core.tracking.matching.flow import LucasKanade, Matches
 from tests.support.true_maps import exact_matches, image, item, matcher, true_graph, true_pose
 
 FRAMES = (0, 4, 8, 12)
@@ -68,6 +68,37 @@ def test_keyframes_are_tied_both_ways_to_those_before() -> None:
         assert np.median(np.linalg.norm(expected - edge.target.T, axis=1)[seen]) < 0.5, (source, to)
 
 
+def torn(before: int, frames: tuple[int, ...], config: InitializationConfig = CONFIG) -> Initializer:
+    """Hardly any points are found between one of these keyframes and that before it: no fourth of the textured ones."""
+    made, true = initializer(config), true_graph(*frames)
+    made.add(image(frames[0]), 3)
+    for last, index in pairwise(frames):
+        found = exact_matches(true, last, true_pose(index))
+        few = np.cumsum(found.alive) <= (29 if index == before else np.inf)
+        made.matcher.flow = Nothing() if index == before else LucasKanade()
+        made.add(image(index), 3, Matches(found.target, np.where(few, found.weight, 0.0)))
+    return made
+
+
+def test_keyframes_that_nothing_ties_to_the_newest_are_no_part_of_a_start() -> None:
+    made = torn(8, (0, 4, 8, 12, 16))
+    assert not made.initialize(), "three of four that are needed"
+    assert made.waiting == [8, 12, 16]
+    assert sorted(made.graph.keyframes) == [8, 12, 16]
+    assert list(made.diagnosis.attempts) == ["matches do not tie the keyframes"]
+    true = true_graph(16)
+    made.add(image(20), 3, exact_matches(true, 16, true_pose(20)))
+    assert made.initialize()
+    assert sorted(made.graph.keyframes) == [8, 12, 16, 20]
+
+
+@pytest.mark.parametrize(("before", "kept"), [(16, [0, 4, 8, 12]), (4, [4, 8, 12, 16])])
+def test_at_the_end_of_a_stream_the_most_that_are_tied_make_the_map(before: int, kept: list[int]) -> None:
+    made = torn(before, (0, 4, 8, 12, 16))
+    assert made.initialize(forced=True)
+    assert sorted(made.graph.keyframes) == kept
+
+
 def test_enough_keyframes_are_solved_and_become_the_map() -> None:
     made = moving()
     assert made.waiting == list(FRAMES)
@@ -77,14 +108,14 @@ def test_enough_keyframes_are_solved_and_become_the_map() -> None:
     assert {keyframe.segment for keyframe in graph.keyframes.values()} == {3}
     found = np.stack([graph.world_from_cam(index) for index in FRAMES])
     true = np.stack([geometry.inverse(true_pose(index)) for index in FRAMES])
-    scale, rotation, shift = geometry.umeyama(found[:, :3, 3], true[:, :3, 3])
+    similarity = geometry.umeyama(found[:, :3, 3], true[:, :3, 3])
     length = np.linalg.norm(true[-1, :3, 3] - true[0, :3, 3])
-    errors = np.linalg.norm(scale * found[:, :3, 3] @ rotation.T + shift - true[:, :3, 3], axis=1)
+    errors = np.linalg.norm(similarity.apply(found[:, :3, 3]) - true[:, :3, 3], axis=1)
     assert errors.max() < 0.02 * length
     depths = true_graph(*FRAMES)
     for index in FRAMES:
         keyframe = graph.keyframes[index]
-        ratio = scale * depths.keyframes[index].inverse_depth / keyframe.inverse_depth
+        ratio = similarity.scale * depths.keyframes[index].inverse_depth / keyframe.inverse_depth
         assert keyframe.triangulated.mean() > 0.3
         assert abs(np.median(ratio[keyframe.triangulated]) - 1.0) < 0.03
 
@@ -133,4 +164,5 @@ def test_few_matches_are_edges_where_the_scale_is_open_without(found: float, tie
     assert not made.graph.edges, "fewer than a quarter"
     made.initialize()
     assert set(made.graph.edges) == (set(pairwise(FRAMES)) if tied else set())
+    assert made.waiting == (list(FRAMES) if tied else [FRAMES[-1]])
     assert not made._weak

@@ -13,6 +13,7 @@ from mvsgs_core.tracking.front_end import Step
 from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, KeyframeChoiceConfig, newest
 from mvsgs_core.tracking.matching.flow import Matches
 from mvsgs_core.tracking.places.localization import Localization
+from mvsgs_core.tracking.tracker import Tracker
 from tests.support.sequences import ate, synthetic, track, tracked_room
 
 SIDE, LIMIT = 320, 0.05  # a keyframe after 16 pixels
@@ -54,11 +55,24 @@ def test_few_matches_that_agree_with_the_pose_make_a_keyframe_after_half_the_flo
         assert choice.moved(seen, SIDE, LIMIT) == wanted
 
 
+@pytest.mark.parametrize(("dark", "first"), [(0, 0), (3, 3), (5, 6)])
+def test_a_map_begins_with_the_first_frame_that_shows_anything_or_the_next_where_that_is_held_out(
+    dark: int, first: int
+) -> None:
+    tracker = Tracker()
+    for item in synthetic(frames=80)[: dark + 2]:
+        image = np.zeros_like(item.image) if item.index < dark else item.image
+        tracker.add(item.index, item.timestamp, image, item.intrinsics).whole()
+    assert tracker.session is not None
+    assert list(tracker.session.initializer.waiting) == [first]
+
+
 @pytest.mark.slow
 def test_no_frame_of_the_room_that_is_held_out_is_mapped() -> None:
     tracker, trajectory, _ = tracked_room()
     keyframes = trajectory.index[trajectory.keyframe].tolist()
     assert not [k for k in keyframes if is_held_out(k)]
+    assert keyframes[0] == 0, "the first view that a user gives"
     assert tracker.stats.counts[HELD_OUT] == 0
     assert np.isfinite(trajectory.world_from_cam).all()
     assert keyframes[-1] == len(trajectory.index) - 1, "the newest view"

@@ -84,6 +84,28 @@ def test_a_camera_that_stays_lost_where_it_stopped_begins_anew(monkeypatch: pyte
     assert tracker.phase is Phase.INITIALIZING
 
 
+def test_a_stream_that_ends_with_one_that_is_none_after_five_lost_frames_reports_no_pose_of_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It is the sixth: a part of its own begins with it, which never comes to be."""
+    tracker, noise = tracking(), np.random.default_rng(0)
+    while not (last := tracker.session._tail.last(tracker.session.choice)):
+        add(tracker, len(tracker.session.records))
+    monkeypatch.setattr(tracker.session.local_map, "agreement", lambda index: 0.0)
+    monkeypatch.setattr(tracker.session.relocalizer, "relocalize", lambda frame: None)
+    monkeypatch.setattr(tracker.session.recovery, "fill_in", lambda records: 0)
+    item, before = synthetic(frames=80)[0], set(tracker.session.graph.keyframes)
+    for _ in range(tracker.config.relocalization.patience - 1):
+        image, number = noise.integers(0, 256, item.image.shape, np.uint8), len(tracker.session.records)
+        assert tracker.add(number, number / 20.0, image, item.intrinsics).state == TrackingState.LOST
+    list(tracker.finish())
+    assert tracker.stats.counts[TAKEN_BACK] == 1
+    assert set(tracker.session.graph.keyframes) == before
+    trajectory = tracker.trajectory()
+    assert trajectory.state[last[0].index] != TrackingState.TRACKED
+    assert not trajectory.posed[last[0].index]
+
+
 def test_each_window_whose_bundle_adjustment_fails_is_counted_and_told_of_once(monkeypatch: pytest.MonkeyPatch) -> None:
     tracker, first = Tracker(), synthetic(frames=80)[0]
     window = tracker.begin((240, 320), first.intrinsics).local_map

@@ -14,7 +14,8 @@ from mvsgs_core.datasets import Item
 from mvsgs_core.kept_map import STREAM
 from mvsgs_core.tracking.known_map import FORMAT, VERSION, WHAT, KnownMap, load
 from mvsgs_core.tracking.phase import Phase
-from mvsgs_core.tracking.tracker import Tracker
+from mvsgs_core.tracking.places.relocalization import Relocalizer
+from mvsgs_core.tracking.tracker import Tracker, TrackerConfig
 from tests.support.sequences import synthetic, tracked_room
 
 pytestmark = pytest.mark.slow
@@ -64,12 +65,11 @@ def test_a_map_comes_back_as_it_was(file: Path) -> None:
 
 
 def test_a_map_knows_whether_its_camera_reads_columns(file: Path, tmp_path: Path) -> None:
-    """One that was kept before there was anything but rows reads rows."""
     meta, arrays = read_arrays(file, FORMAT, VERSION, WHAT)
     meta = {name: value for name, value in meta.items() if name not in ("format", "version", "reads_columns")}
     meta["readout_time"] = 0.02
-    for said, expected in (({"reads_columns": True}, True), ({}, False)):
-        write_arrays(tmp_path / "map.npz", FORMAT, VERSION, meta | said, arrays)
+    for expected in (True, False):
+        write_arrays(tmp_path / "map.npz", FORMAT, VERSION, meta | {"reads_columns": expected}, arrays)
         known = load(tmp_path / "map.npz")
         assert (known.readout_time, known.reads_columns) == (0.02, expected)
         assert returning(known, back()[:1]).reads_columns == expected
@@ -78,11 +78,21 @@ def test_a_map_knows_whether_its_camera_reads_columns(file: Path, tmp_path: Path
         load(tmp_path / "map.npz")
 
 
-def test_of_a_map_that_was_kept_without_weights_all_points_stand_still(file: Path, tmp_path: Path) -> None:
+def test_the_start_of_another_part_leaves_the_readout_time_of_the_map(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is of six keyframes, the map's of more."""
+    monkeypatch.setattr(Relocalizer, "relocalize", lambda *_: None)
     meta, arrays = read_arrays(file, FORMAT, VERSION, WHAT)
-    meta = {name: value for name, value in meta.items() if name not in ("format", "version")}
-    write_arrays(tmp_path / "map.npz", FORMAT, VERSION, meta, {n: a for n, a in arrays.items() if n != "static"})
-    assert all((keyframe.static == 1.0).all() for keyframe in load(tmp_path / "map.npz").keyframes)
+    meta = {name: value for name, value in meta.items() if name not in ("format", "version")} | {"readout_time": 0.02}
+    write_arrays(tmp_path / "map.npz", FORMAT, VERSION, meta, arrays)
+    tracker = Tracker(TrackerConfig(loops=False), known=load(tmp_path / "map.npz").renumbered(STREAM))
+    for item in synthetic(frames=80)[:30]:
+        tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
+    assert tracker.phase is Phase.TRACKING
+    assert tracker.session.segment > 0
+    list(tracker.finish())
+    assert tracker.readout_time == 0.02
 
 
 def test_the_camera_is_found_and_tracked_in_the_frame_of_the_map(file: Path) -> None:
@@ -101,8 +111,8 @@ def test_the_camera_is_found_and_tracked_in_the_frame_of_the_map(file: Path) -> 
     true = np.stack([np.asarray(item.world_from_cam)[:3, 3] for item in items])
     before = np.stack([first[item.index][:3, 3] for item in items])
     assert np.median(np.linalg.norm(trajectory.world_from_cam[:, :3, 3] - before, axis=1)) < 0.01 * depth
-    s, r, t = geometry.umeyama(trajectory.world_from_cam[:, :3, 3], true)
-    assert np.abs(s * trajectory.world_from_cam[:, :3, 3] @ r.T + t - true).max() < 0.01
+    centers = trajectory.world_from_cam[:, :3, 3]
+    assert np.abs(geometry.umeyama(centers, true).apply(centers) - true).max() < 0.01
     assert updates[-1].correction is not None
     assert {keyframe.index - STREAM for keyframe in known.keyframes} <= set(updates[-1].correction.index.tolist())
     assert updates[-1].correction.exposure is not None, "the light is another"

@@ -14,6 +14,7 @@ from mvsgs_core.stats import Stats
 from mvsgs_core.tracking import local_map, photometer
 from mvsgs_core.tracking.back_end import BackEnd, BackEndConfig
 from mvsgs_core.tracking.edges import Edge, Edges
+from mvsgs_core.tracking.estimation import lights
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solution
 from mvsgs_core.tracking.estimation.pose_graph import (
     PoseGraphSolution,
@@ -28,6 +29,7 @@ from mvsgs_core.tracking.matching.flow import Matches
 from mvsgs_core.tracking.places import thinning
 from mvsgs_core.tracking.places.retrieval import Retrieval
 from mvsgs_core.tracking.publish import Publisher
+from mvsgs_core.tracking.steps import whole
 from tests.support.true_maps import matcher, tie
 
 NO_EDGE = Edge(np.zeros((2, 0)), np.zeros(0), np.zeros((2, 0)), 1.0)
@@ -152,8 +154,8 @@ def test_exposures_of_many_keyframes_are_solved_for_the_newest(at_once: int, mon
     graph, gains = flickering()
     growing = KeyframeGraph(graph.intrinsics)
     light, solved = photometer.Photometer(growing, Stats()), []
-    solve = photometer.solve_photometry
-    monkeypatch.setattr(photometer, "solve_photometry", lambda e, n, known: solved.append(n) or solve(e, n, known))
+    solve = lights.solve_photometry
+    monkeypatch.setattr(lights, "solve_photometry", lambda e, n, known: solved.append(n) or solve(e, n, known))
     for index, keyframe in graph.keyframes.items():
         growing.add(keyframe)
         growing.edges |= {pair: graph.edges[pair] for pair in graph.edges if max(pair) == index}
@@ -274,16 +276,17 @@ def residual(graph: KeyframeGraph) -> float:
 
 def test_a_large_map_is_adjusted_in_blocks_of_bounded_size(monkeypatch: pytest.MonkeyPatch) -> None:
     graph, sizes = disturbed(), []
-    whole = KeyframeGraph.optimize
+    at_once = KeyframeGraph.optimize
 
     def optimize(self: KeyframeGraph, indices: set[int], poses: set[int], *rest: object) -> Solution:
         sizes.append(len(poses))
-        return whole(self, indices, poses, *rest)  # type: ignore[arg-type]
+        return at_once(self, indices, poses, *rest)  # type: ignore[arg-type]
 
     monkeypatch.setattr(KeyframeGraph, "optimize", optimize)
     back = BackEnd(graph, LocalMap(graph, matcher(), LocalMapConfig(), 1), BackEndConfig(max_keyframes=5), 1)
     before = residual(graph)
-    assert back.step(0).failure == ""
+    back.pending = 1
+    assert whole(back.working(0)) == ""
     assert residual(graph) < before
     back.adjust(0)
     assert max(sizes) <= 5

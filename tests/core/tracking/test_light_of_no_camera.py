@@ -10,6 +10,7 @@ import pytest
 
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking import photometer
+from mvsgs_core.tracking.estimation import lights
 from mvsgs_core.tracking.estimation.photometry import PhotometricCalibration
 from mvsgs_core.tracking.known_map import load, save
 from mvsgs_core.tracking.photometer import FrameLight, Photometer
@@ -38,7 +39,7 @@ def test_they_are_none_and_counted_once() -> None:
         assert found is not None
         assert np.isfinite(found).all(axis=(1, 2)).tolist() == [False, True]
     assert light.stats.counts["refused_exposures"] == 2, "an exposure and the vignetting"
-    assert light.stats.warnings.lines() == [f"{photometer.NO_LIGHT} (2 times)"]
+    assert light.stats.warnings.lines() == [f"{lights.NO_LIGHT} (2 times)"]
 
 
 def test_a_map_that_is_kept_can_be_read(tmp_path: Path) -> None:
@@ -60,7 +61,7 @@ def test_exposures_that_follow_another_response_are_known_to_be_others(monkeypat
     light._lights = dict(zip(FRAMES, light.photometry.lights))
     was, made_of = light.exposure(8), light.known(8)
     monkeypatch.setattr(photometer, "AT_ONCE", 1)
-    monkeypatch.setattr(photometer, "solve_photometry", lambda *_: replace(light.photometry, response=0.3))
+    monkeypatch.setattr(lights, "solve_photometry", lambda *_: replace(light.photometry, response=0.3))
     light._solve([0, 8, 16], False)
     assert np.abs(light.exposure(8) - was).max() > 0.01
     assert light.known(8) is not made_of

@@ -18,6 +18,7 @@ from mvsgs_core.tracking.places.geometric_verification import PlaceMatch
 from mvsgs_core.tracking.places.localization import Localization
 from mvsgs_core.tracking.places.loop_closure import LoopCloser, LoopConfig
 from mvsgs_core.tracking.places.retrieval import Retrieval
+from mvsgs_core.tracking.steps import whole
 from tests.support.true_maps import exact_matches, matcher, shuffled, true_graph, true_keyframe
 
 COUNT = 24  # cameras of the ring, 3 from its center
@@ -84,9 +85,9 @@ def errors(true: KeyframeGraph, graph: KeyframeGraph) -> tuple[float, float]:
     """Largest position error after Sim(3) alignment, and the largest ratio of two keyframes' units."""
     order = sorted(graph.keyframes)
     found, wanted = (np.stack([g.world_from_cam(n)[:3, 3] for n in order]) for g in (graph, true))
-    s, r, t = geometry.umeyama(found, wanted)
+    aligned = geometry.umeyama(found, wanted).apply(found)
     ratios = [float(np.median(u)) for u in units(true, graph).values()]
-    return float(np.linalg.norm(s * found @ r.T + t - wanted, axis=1).max()), max(ratios) / min(ratios)
+    return float(np.linalg.norm(aligned - wanted, axis=1).max()), max(ratios) / min(ratios)
 
 
 def state(graph: KeyframeGraph) -> list[np.ndarray]:
@@ -241,7 +242,7 @@ def test_a_round_through_the_room_is_closed_by_its_images() -> None:
     true = true_graph(*AROUND)
     graph = drifted(true, 1.01, turn=0.005)
     position, ratio = errors(true, graph)
-    closure = closer(graph).search(298)
+    closure = whole(closer(graph).searching(298))
     assert closure is not None
     assert (closure.source, closure.to) == (0, 298)
     assert closure.moved
@@ -257,7 +258,7 @@ def test_a_second_segment_is_joined_by_its_images() -> None:
     graph = true_graph(0, 4, 8)
     for number in (2, 6):
         graph.add(true_keyframe(number, unit=2.0, segment=1))
-    closure = closer(graph).search(6) or closer(graph).search(2)
+    closure = whole(closer(graph).searching(6)) or whole(closer(graph).searching(2))
     assert closure is not None
     assert closure.joined == 1
     position, ratio = errors(true, graph)
@@ -271,7 +272,7 @@ def test_a_false_match_is_refused() -> None:
     graph.keyframes[298].image = shuffled(0, 298)
     made, before = closer(graph), state(graph)
     assert made.retrieval.query(graph.keyframes[298].image.features()[1], 1, set()) == [0]
-    assert made.search(298) is None
+    assert whole(made.searching(298)) is None
     assert not graph.edges
     for a, b in zip(before, state(graph)):
         np.testing.assert_array_equal(a, b)
@@ -282,7 +283,7 @@ def test_what_edges_tie_already_is_no_loop(tied: tuple[int, ...], source: int) -
     graph = true_graph(*AROUND)
     for pair in pairwise(tied):
         graph.edges[pair] = NO_EDGE
-    closure = closer(graph).search(298)
+    closure = whole(closer(graph).searching(298))
     assert closure is not None
     assert closure.source == source
 
@@ -301,4 +302,4 @@ def test_rotations_stay_rotations_over_many_loops(monkeypatch: pytest.MonkeyPatc
 
 
 def test_what_is_near_in_time_is_no_loop() -> None:
-    assert closer(true_graph(*AROUND), LoopConfig(min_gap=len(AROUND))).search(298) is None
+    assert whole(closer(true_graph(*AROUND), LoopConfig(min_gap=len(AROUND))).searching(298)) is None

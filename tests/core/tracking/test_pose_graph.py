@@ -72,8 +72,8 @@ def ring(n: int = 40, drift: float = 0.99) -> tuple[np.ndarray, np.ndarray, Simi
 def error(similarities: np.ndarray, truth: np.ndarray) -> float:
     found = inverse_similarity(similarities)[:, :3, 3]
     wanted = geometry.inverse(truth)[:, :3, 3]
-    s, r, t = geometry.umeyama(found, wanted)
-    return float(np.sqrt(np.mean(np.sum(np.square(s * found @ r.T + t - wanted), axis=1))))
+    aligned = geometry.umeyama(found, wanted).apply(found)
+    return float(np.sqrt(np.mean(np.sum(np.square(aligned - wanted), axis=1))))
 
 
 def test_a_loop_takes_the_drift_of_scale_away() -> None:

@@ -48,7 +48,25 @@ def test_held_out_frames_are_no_keyframes_and_the_newest_view_is_one() -> None:
     keyframes = list(depths(1.0))
     assert len(keyframes) >= 5
     assert not [k for k in keyframes if is_held_out(k)]
+    assert keyframes[0] == 0, "the first view that a user gives"
     assert keyframes[-1] >= 38, "the newest view"
+
+
+@pytest.mark.parametrize("first", [0, 3, 5])
+def test_a_camera_that_is_known_from_a_held_out_frame_on_begins_with_the_next(first: int) -> None:
+    tracker = PosedTracker(PosedConfig(), (HEIGHT, WIDTH), INTRINSICS)
+    for index, x in enumerate([0.0, 0.01, 0.02], first):
+        tracker.add(index, index / 30.0, view(pose(0.0, x)), pose(0.0, x))
+    assert list(tracker.graph.keyframes) == [6 if first == 5 else first]
+
+
+def test_a_held_out_frame_that_had_to_be_a_keyframe_stays_one_where_the_camera_brakes() -> None:
+    tracker = PosedTracker(PosedConfig(), (HEIGHT, WIDTH), INTRINSICS)
+    for index, x in [(3, 0.0), (4, 0.15), (5, 0.35), (6, 0.36), (7, 0.37)]:
+        tracker.add(index, index / 30.0, view(pose(0.0, x)), pose(0.0, x))
+    assert list(tracker.graph.keyframes) == [3, 5]
+    assert tracker.keyframe(5).triangulated.mean() > 0.5
+    assert tracker.stats.counts["keyframes"] == 2
 
 
 @pytest.mark.slow

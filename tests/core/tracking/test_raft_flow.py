@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from mvsgs_core.tracking.image import TrackingImage
-from mvsgs_core.tracking.matching.flow import make_flow
-from mvsgs_core.tracking.matching.raft_flow import RaftFlow, RefinedRaftFlow, _sample
+from mvsgs_core.tracking.matching.flow import Flow, make_flow
+from mvsgs_core.tracking.matching.raft_flow import RaftFlow, _sample, refined_raft
 from tests.support.shared_data import shared
 
 SHIFT = np.array([21.0, -13.0])
@@ -29,8 +31,8 @@ def test_a_flow_is_read_where_the_points_are() -> None:
     np.testing.assert_allclose(_sample(np.stack([u, v]).astype(np.float32), points), points, atol=0.05)
 
 
-@pytest.mark.parametrize(("kind", "allowed"), [(RaftFlow, 0.3), (RefinedRaftFlow, 0.05)])
-def test_finds_a_large_motion_without_a_guess(kind: type[RaftFlow], allowed: float) -> None:
+@pytest.mark.parametrize(("kind", "allowed"), [(RaftFlow, 0.3), (refined_raft, 0.05)])
+def test_finds_a_large_motion_without_a_guess(kind: Callable[..., Flow], allowed: float) -> None:
     flow = kind(weights=str(shared("weights/raft-small.pth")))
     assert flow.needs_color
     a, b = pair()
@@ -44,7 +46,7 @@ def test_finds_a_large_motion_without_a_guess(kind: type[RaftFlow], allowed: flo
 
 
 def test_a_point_that_leaves_the_image_is_lost() -> None:
-    flow = RaftFlow(weights=str(shared("weights/raft-small.pth")))
+    flow = refined_raft(weights=str(shared("weights/raft-small.pth")))
     a, b = pair()
     points = np.array([[185.0, 60.0], [90.0, 3.0], [90.0, 60.0]])
     guess = points + SHIFT
@@ -54,7 +56,7 @@ def test_a_point_that_leaves_the_image_is_lost() -> None:
 
 def test_missing_weights_and_missing_color_say_what_to_do() -> None:
     with pytest.raises(FileNotFoundError, match="RAFT"):
-        make_flow("mvsgs_core.tracking.matching.raft_flow:RaftFlow", weights="nowhere.pth")
+        make_flow("raft_small", weights="nowhere.pth")
     flow = RaftFlow(weights=str(shared("weights/raft-small.pth")))
     gray = [TrackingImage.of(n, 0.0, np.zeros((64, 64, 3), np.uint8), (64, 64), False) for n in range(2)]
     points = np.full((1, 2), 30.0)

@@ -21,7 +21,7 @@ from mvsgs_core.tracking.places.relocalization import RelocalizationConfig
 from mvsgs_core.tracking.tracker import Tracker
 from tests.support.sequences import synthetic, track
 from tests.support.shared_data import shared
-from tests.support.true_maps import image, matcher, pose_error, true_graph, true_pose
+from tests.support.true_maps import image, matcher, pose_error, shuffled, true_graph, true_pose
 
 pytestmark = pytest.mark.slow
 
@@ -57,10 +57,8 @@ def test_each_lost_run_is_followed_from_its_own_keyframes() -> None:
     lost = [*range(30, 32), *range(47, 51)]
     assert not known[lost].any()
     truth = np.stack([np.asarray(i.world_from_cam) for i in items])
-    scale, rotation, shift = geometry.umeyama(trajectory.world_from_cam[known, :3, 3], truth[known, :3, 3])
-    errors = np.linalg.norm(
-        scale * trajectory.world_from_cam[known, :3, 3] @ rotation.T + shift - truth[known, :3, 3], axis=1
-    )
+    found, true = trajectory.world_from_cam[known, :3, 3], truth[known, :3, 3]
+    errors = np.linalg.norm(geometry.umeyama(found, true).apply(found) - true, axis=1)
     assert errors.max() < 0.02, "meters"
 
 
@@ -90,12 +88,9 @@ def test_frames_before_the_start_are_verified_or_have_no_pose() -> None:
     np.testing.assert_array_equal(known, np.isin(trajectory.state, (TrackingState.TRACKED, TrackingState.DEGENERATE)))
     assert known[8:].all(), "what is verified is posed"
     truth = np.stack([np.asarray(i.world_from_cam) for i in items])
-    scale, rotation, shift = geometry.umeyama(
-        trajectory.world_from_cam[trajectory.keyframe, :3, 3], truth[trajectory.keyframe, :3, 3]
-    )
-    errors = np.linalg.norm(
-        scale * trajectory.world_from_cam[known, :3, 3] @ rotation.T + shift - truth[known, :3, 3], axis=1
-    )
+    found, true, keyframe = trajectory.world_from_cam[:, :3, 3], truth[:, :3, 3], trajectory.keyframe
+    aligned = geometry.umeyama(found[keyframe], true[keyframe]).apply(found)
+    errors = np.linalg.norm(aligned - true, axis=1)[known]
     assert errors.max() < 0.2, "meters: frames that nothing verified were up to 0.32 off"
     assert any("have no pose" in warning for warning in tracker.stats.warnings)
 
@@ -151,6 +146,17 @@ def test_poses_that_are_uncertain_or_of_lost_frames_are_none(config: RecoveryCon
     lost.keep(image(101))
     assert lost.fill_in(seen) == 0
     assert seen[1].reference is None
+
+
+def test_images_keep_no_pyramids() -> None:
+    """Those of 400 would be a fifth of a gigabyte."""
+    lost = recovery(100, 200)
+    seen = records([100, 101, 102, 103, 200], [100, 200])
+    for frame in (image(101), image(20, 102), shuffled(103, 103)):
+        lost.keep(frame)
+    assert lost.fill_in(seen) == 1
+    images = [*lost._images.values(), *(keyframe.image for keyframe in lost.graph.keyframes.values())]
+    assert not [each.index for each in images if "pyramid" in vars(each)]
 
 
 def test_the_oldest_images_go_first() -> None:

@@ -12,10 +12,11 @@ from mvsgs_core.camera import is_readout_time, told_readout_time
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.tracking.estimation import rolling_shutter
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, reproject
-from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity, estimate_readout
+from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity, estimating_readout
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches
+from mvsgs_core.tracking.steps import whole
 from mvsgs_core.tracking.tracker import TrackerConfig
 from tests.support.sequences import ate, track, tracked_room
 from tests.support.shared_data import shared
@@ -66,7 +67,7 @@ def graph_of(
 def test_readout_is_found(readout_time: float, reads_columns: bool) -> None:
     graph, _ = graph_of(readout_time, reads_columns)
     assert len(graph.edges) > 20
-    found = estimate_readout(graph, graph.keyframes, threads=1)
+    found = whole(estimating_readout(graph, graph.keyframes, threads=1))
     assert found.readout_time == pytest.approx(readout_time, abs=0.002)
     assert found.reads_columns == (reads_columns and readout_time != 0.0)
     assert (graph.readout_time, graph.reads_columns) == (0.0, False), "only the caller changes the graph"
@@ -77,7 +78,7 @@ def test_where_nothing_can_be_said_it_stays_what_it_was(monkeypatch: pytest.Monk
     graph.readout_time, graph.reads_columns = 0.02, True
     adjust = rolling_shutter.adjust
     monkeypatch.setattr(rolling_shutter, "adjust", lambda *given: replace(adjust(*given), failure="no"))
-    assert estimate_readout(graph, graph.keyframes, threads=1) == (0.02, True)
+    assert whole(estimating_readout(graph, graph.keyframes, threads=1)) == (0.02, True)
 
 
 def test_a_camera_upside_down_reads_its_last_row_first_and_is_told_so() -> None:

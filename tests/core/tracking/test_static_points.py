@@ -14,12 +14,13 @@ from mvsgs_core.tracking.assessment import tell_what_moves
 from mvsgs_core.tracking.edges import Edge
 from mvsgs_core.tracking.estimation.bundle_adjustment import Graph, Solver, adjust
 from mvsgs_core.tracking.estimation.static_points import STILL, static_weights
-from mvsgs_core.tracking.estimation.structure_from_motion import EPIPOLAR, PAIRS, ReconstructionCriteria, reconstruct
+from mvsgs_core.tracking.estimation.structure_from_motion import EPIPOLAR, PAIRS, ReconstructionCriteria, reconstructing
 from mvsgs_core.tracking.estimation.two_view_starts import two_view_poses, widest_pairs
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.local_map import LocalMap, LocalMapConfig
 from mvsgs_core.tracking.matching.flow import Matches
 from mvsgs_core.tracking.places.localization import localize
+from mvsgs_core.tracking.steps import whole
 from mvsgs_core.tracking.tracker import Tracker
 from tests.support.keyframe_graphs import noisy, scene
 from tests.support.sequences import ate, synthetic
@@ -158,11 +159,11 @@ def test_a_start_is_not_bent_by_what_moves_where_the_calibration_is_known() -> N
     errors = {}
     for weighing in (False, True):
         graph.weighing = weighing
-        found = reconstruct(graph, list(FRAMES), ReconstructionCriteria(), 1)
+        found = whole(reconstructing(graph, list(FRAMES), ReconstructionCriteria(), 1))
         true = np.stack([true_pose(n) for n in FRAMES])
         here, there = (geometry.inverse(poses)[:, :3, 3] for poses in (found.cam_from_world, true))
-        s, r, t = geometry.umeyama(here, there)
-        errors[weighing] = float(np.abs(s * here @ r.T + t - there).max())
+        aligned = geometry.umeyama(here, there).apply(here)
+        errors[weighing] = float(np.abs(aligned - there).max())
         if weighing:
             assert found.failure == ""
             corner = np.stack([in_a_corner(graph, n) for n in FRAMES])
@@ -177,8 +178,8 @@ def test_a_start_is_not_bent_by_what_moves_where_the_calibration_is_known() -> N
 def test_a_start_of_which_most_moves_is_none() -> None:
     graph = circling(*FRAMES)
     graph.weighing = True
-    assert reconstruct(graph, list(FRAMES), ReconstructionCriteria(), 1).failure == ""
-    refused = reconstruct(graph, list(FRAMES), ReconstructionCriteria(min_still=1.01), 1).failure
+    assert whole(reconstructing(graph, list(FRAMES), ReconstructionCriteria(), 1)).failure == ""
+    refused = whole(reconstructing(graph, list(FRAMES), ReconstructionCriteria(min_still=1.01), 1)).failure
     assert "stand still" in refused
     assert "%" in refused
 

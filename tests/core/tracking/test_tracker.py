@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -59,7 +60,7 @@ def test_depths_agree_with_the_truth() -> None:
     items = synthetic(frames=80)
     tracker, trajectory, _ = tracked_room()
     found, true = trajectory.world_from_cam[:, :3, 3], np.stack([np.asarray(i.world_from_cam)[:3, 3] for i in items])
-    scale, _, _ = geometry.umeyama(found, true)
+    scale = geometry.umeyama(found, true).scale
     ratios, known = [], []
     for index in trajectory.index[trajectory.keyframe][2:-2]:
         keyframe, depth = tracker.keyframe(int(index)), items[int(index)].depth
@@ -188,6 +189,21 @@ def test_a_camera_at_rest_makes_no_keyframes() -> None:
     assert tracker.stats.skipped["frames that did not move"] >= 19
     shift = np.linalg.norm(trajectory.world_from_cam[41:, :3, 3] - trajectory.world_from_cam[40, :3, 3], axis=1)
     assert shift.max() < 1e-3
+
+
+def test_a_lamp_that_comes_into_view_in_a_dark_room_costs_no_frame() -> None:
+    """All of the picture would have another gain from one frame to the next."""
+    items = []
+    for item in synthetic(frames=80)[:40]:
+        dark = (0.1 * item.image).astype(np.uint8)
+        if item.index >= 25:
+            cv2.circle(dark, (400 - 6 * item.index, 60), 24, (255, 255, 255), -1, cv2.LINE_AA)
+        items.append(replace(item, image=dark))
+    tracker, trajectory, _ = track(items)
+    error, length = ate(trajectory, items)
+    assert error < 0.005 * length
+    assert (trajectory.state == TrackingState.TRACKED).all()
+    assert tracker.phase is Phase.TRACKING
 
 
 def test_a_real_hand_held_sequence() -> None:
