@@ -1,8 +1,11 @@
-"""Where what can be had again is kept: downloaded weights, scenes that took seconds to build."""
+"""Where what can be had again is kept: downloaded weights, scenes that took seconds to build, compiled kernels."""
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 
@@ -16,3 +19,19 @@ def cache_folder() -> Path | None:
         return (given if given.is_absolute() else Path.home() / ".cache") / "mvsgs"
     except RuntimeError:
         return None
+
+
+def written_folder(name: str) -> Path:
+    """A folder of that, of this name, for who cannot do without one; a temporary one, which goes with this process,
+    where it cannot be written."""
+    if (cache := cache_folder()) is not None:
+        try:
+            (cache / name).mkdir(parents=True, exist_ok=True)
+        except OSError:
+            pass
+        else:
+            if os.access(cache / name, os.W_OK | os.X_OK):
+                return cache / name
+    made = Path(tempfile.mkdtemp(prefix=f"mvsgs-{name}-"))
+    atexit.register(shutil.rmtree, made, ignore_errors=True)
+    return made

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from typing import Generic, NamedTuple, Protocol, Self, TypeVar
 
@@ -40,6 +41,7 @@ class WindowedKeyframe(Protocol):
 
 
 K = TypeVar("K", bound=WindowedKeyframe)
+R = TypeVar("R")  # what a stage makes of a keyframe
 
 
 class KeyframeWindow(Generic[K]):
@@ -92,3 +94,46 @@ class KeyframeWindow(Generic[K]):
         index = self._waiting.pop(0)
         others = [k for k in self._keyframes if k.index != index]
         return next(k for k in self._keyframes if k.index == index), others
+
+
+class WindowedStage(ABC, Generic[K, R]):
+    """Feeds on keyframes in stream order; `add` and `flush` yield each wanted one's result exactly once, in order."""
+
+    def __init__(self, before: int, lag: int) -> None:
+        self._before, self._lag = before, lag
+        self._window = KeyframeWindow[K](before, lag)
+
+    def add(self, view: K, wanted: bool = True) -> Iterator[R]:
+        """Of the keyframe `lag` before this one; of all that wait if this one starts a new segment or size.
+
+        wanted: whether this one is to get a result too; else it is a neighbor of others only.
+        """
+        for reference, others in self._window.add(view, wanted):
+            yield self._result(reference, others)
+
+    def release(self) -> Iterator[R]:
+        """Of the keyframe that has waited longest, though fewer than `lag` came after it."""
+        for reference, others in self._window.release():
+            yield self._result(reference, others)
+
+    def flush(self) -> Iterator[R]:
+        """Of the keyframes that still wait, with the neighbors that are there."""
+        for reference, others in self._window.flush():
+            yield self._result(reference, others)
+
+    def forget(self) -> None:
+        """The keyframes that come next are of another map. None waits: see `flush`."""
+        self._window = KeyframeWindow[K](self._before, self._lag)
+
+    @property
+    def waiting(self) -> int | None:
+        """Index of the keyframe that has waited longest for later ones."""
+        return self._window.waiting
+
+    def move(self, poses: dict[int, Correction]) -> None:
+        """Corrections by keyframe index, for what is still in the window."""
+        self._window.move(poses)
+
+    @abstractmethod
+    def _result(self, reference: K, others: list[K]) -> R:
+        """others: the keyframes of the window around it."""

@@ -21,7 +21,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import DownloadColumn, Progress, TransferSpeedColumn
 
-from .cache_folder import cache_folder
+from mvsgs_core.cache_folder import cache_folder
 
 _BLOCK = 1 << 20  # bytes
 _HEAD = 512  # bytes that tell what a file is

@@ -31,7 +31,7 @@ from mvsgs_core.export.image_sizes import check_sizes
 from mvsgs_core.export.mesh import write_mesh
 from mvsgs_core.export.ply import relative_origin, write_ply
 from mvsgs_core.export.snapshot import Snapshot
-from mvsgs_core.export.splat import spz_origin, write_splat, write_spz
+from mvsgs_core.export.splat import WRITERS, spz_origin
 from mvsgs_core.export.transforms import write_transforms
 from mvsgs_core.export.turning import RUB_FROM_RDF
 from mvsgs_core.georeference import FILE as GEOREFERENCE
@@ -50,7 +50,7 @@ def splats(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
     if out.suffix == ".ply":
         write_ply(out, final, fold=options.fold)
     else:
-        {".splat": write_splat, ".spz": write_spz}[out.suffix](out, final)
+        WRITERS[out.suffix](out, final)
     shaped = out.suffix == ".ply" and final.kernel != "gaussian" and not options.fold
     silent = final.antialiased and out.suffix != ".spz"
     told = "; shaped: other viewers need --fold" if shaped else ""

@@ -17,7 +17,8 @@ from mvsgs_core.export.image_sizes import check_size
 from mvsgs_core.export.keyframe_images import image_name, there
 from mvsgs_core.export.keyframe_render import near_plane
 from mvsgs_core.export.snapshot import Snapshot
-from mvsgs_core.rasterizer.spherical_harmonics import C0
+from mvsgs_core.rasterizer.interface import as_bytes
+from mvsgs_core.rasterizer.spherical_harmonics import to_rgb
 
 BEHIND = 0.03  # of the rendered depth: a point farther behind the surface is hidden by it
 HEADS = {  # the first lines of our files, which COLMAP's own begin otherwise
@@ -82,7 +83,7 @@ def write_colmap(
         points2d = zip((pixels + 0.5).tolist(), (seen + 1).tolist(), strict=True)
         text.append(" ".join(f"{x!r} {y!r} {point}" for (x, y), point in points2d))
     _write(model / "images.txt", text)
-    colors = np.clip((0.5 + C0 * final.splats.sh[:, 0].numpy()[solid]) * 255.0, 0, 255).round().astype(int)
+    colors = as_bytes(to_rgb(final.splats.sh[:, 0]))[solid]
     world = (means + final.origin).tolist()
     text = [HEADS["points3D.txt"]]
     for k, ((x, y, z), (r, g, b), track) in enumerate(zip(world, colors.tolist(), tracks, strict=True)):

@@ -11,12 +11,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from mvsgs_core import geometry
 from mvsgs_core.export.command_line import input_arguments, lens, read_map, read_path, run
 from mvsgs_core.export.keyframe_render import near_plane
 from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.rasterizer.interface import as_bytes
 from mvsgs_core.video_file import write_video
 
 
@@ -37,7 +37,7 @@ def frames_along(
     """Renders (H, W, 3) uint8 RGB of the map from each pose (K, 4, 4)."""
     for pose in world_from_cam:
         color = final.render(pose, intrinsics, size, near=near_plane(final, pose)).color
-        yield (color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
+        yield as_bytes(color)
 
 
 def render_path(options: argparse.Namespace) -> str:

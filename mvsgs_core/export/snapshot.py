@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from mvsgs_core import geometry
 from mvsgs_core.rasterizer.rasterize import Render, rasterize
 from mvsgs_core.rasterizer.splats import Splats
 
@@ -66,6 +67,5 @@ class Snapshot:
         splats = replace(
             self.splats, means=self.splats.means * factor, log_scales=self.splats.log_scales + math.log(factor)
         )
-        poses = self.world_from_cam.copy()
-        poses[:, :3, 3] *= factor
+        poses = geometry.scaled(self.world_from_cam, factor)
         return replace(self, splats=splats, origin=self.origin * factor, world_from_cam=poses)

@@ -17,6 +17,7 @@ from mvsgs_core.datasets.lens import Lens
 
 GIVEN, ESTIMATED, GUESSED = "given", "estimated", "guessed"  # by the user or the data set; by the tracker; by nobody
 FACTOR = "focal length over its guess"  # so the tracker counts it
+PHOTOGRAPHS = "lens of the photographs"  # so their tracker says [factor on the focal lengths, k1, k2]
 UNTESTED = "it is a guess that nothing has tested"
 LENS = "lens"  # under this name a source says its lens, `lens_values`
 
@@ -81,13 +82,16 @@ def source_camera(statistics: Mapping[str, Any]) -> SourceCamera | None:
     try:
         lens = _lens(values[LENS])
         sigma, readout = values.get("focal_sigma_percent"), values.get("readout_time")
-        found = lens.guessed and sigma is not None
+        shared = values.get(PHOTOGRAPHS)
+        found = shared is not None or (lens.guessed and sigma is not None)
         error = float(sigma) / 100.0 if found and sigma is not None else None
-        factor = float(values[FACTOR]) if found else 1.0
+        factor, k1, k2 = (float(v) for v in shared or ((values[FACTOR] if found else 1.0), 0.0, 0.0))
+        if (k1 or k2) and not lens.distorted:  # of a lens that bends beyond what was given, both cannot be said as one
+            lens = replace(lens, distortion=(k1, k2, 0.0, 0.0))
         fx, fy, cx, cy = lens.intrinsics
         doubt = str(values.get("focal_doubt") or ("" if found or not lens.guessed else UNTESTED))
-        k1, k1_sigma = values.get("radial_k1"), values.get("radial_k1_sigma")
-        radial = (float(k1), float(k1_sigma)) if found and k1 is not None and k1_sigma is not None else None
+        left, sure = values.get("radial_k1"), values.get("radial_k1_sigma")
+        radial = (float(left), float(sure)) if found and left is not None and sure is not None else None
         camera = SourceCamera(
             replace(lens, intrinsics=(factor * fx, factor * fy, cx, cy), guessed=lens.guessed and not found),
             ESTIMATED if found else GUESSED if lens.guessed else GIVEN,
@@ -114,14 +118,14 @@ def camera_values(camera: SourceCamera) -> dict[str, Any]:
 def camera_of(values: Mapping[str, Any]) -> SourceCamera:
     """What `camera_values` made. Raises ValueError for what it did not."""
     try:
-        sigma, readout, radial = values["focal_sigma"], values["readout_time"], values.get("radial")
+        sigma, readout, radial = values["focal_sigma"], values["readout_time"], values["radial"]
         if radial is not None and not (isinstance(radial, list) and len(radial) == 2):
             raise ValueError(f"`radial` is {radial!r}")
         return SourceCamera(
             _lens(values), str(values["origin"]), None if sigma is None else float(sigma), str(values["doubt"]),
             None if readout is None else float(readout),
             None if radial is None else (float(radial[0]), float(radial[1])),
-            bool(values.get("reads_columns", False)),
+            bool(values["reads_columns"]),
         )  # fmt: skip
     except (KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"{error!r}") from error

@@ -12,7 +12,8 @@ from mvsgs_core.export import spz
 from mvsgs_core.export.ply import folded, relative_origin
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.export.turning import RUB_FROM_RDF, turned
-from mvsgs_core.rasterizer.spherical_harmonics import C0
+from mvsgs_core.rasterizer.interface import as_bytes
+from mvsgs_core.rasterizer.spherical_harmonics import to_rgb
 
 
 def write_splat(path: Path, final: Snapshot) -> None:
@@ -30,9 +31,10 @@ def write_splat(path: Path, final: Snapshot) -> None:
     )
     rows["mean"] = means
     rows["scale"] = splats.log_scales.exp().numpy()
-    rows["color"][:, :3] = _bytes((0.5 + C0 * splats.sh[:, 0]).numpy() * 255.0)
-    rows["color"][:, 3] = _bytes(opacity.numpy() * 255.0)
-    rows["rotation"] = _bytes(torch.nn.functional.normalize(splats.quaternions, dim=1).numpy() * 128.0 + 128.0)
+    rows["color"][:, :3] = as_bytes(to_rgb(splats.sh[:, 0]))
+    rows["color"][:, 3] = as_bytes(opacity)
+    rotation = torch.nn.functional.normalize(splats.quaternions, dim=1)
+    rows["rotation"] = np.clip(np.round(rotation.numpy() * 128.0 + 128.0), 0, 255)
     weight = splats.log_scales.sum(dim=1) + opacity.log()
     order = torch.argsort(weight, descending=True, stable=True).numpy()
     with replacing(path, sync=False) as aside:
@@ -75,5 +77,4 @@ def spz_origin(final: Snapshot) -> np.ndarray:
     return relative if relative.any() or world < spz.REACH else final.origin
 
 
-def _bytes(values: np.ndarray) -> np.ndarray:
-    return np.asarray(np.clip(np.round(values), 0, 255).astype(np.uint8))
+WRITERS = {".splat": write_splat, ".spz": write_spz}  # by suffix

@@ -6,13 +6,10 @@ import json
 import os
 from pathlib import Path
 
-import numpy as np
-
 from mvsgs_core.atomic_file import replace_text
 from mvsgs_core.export.cameras import Cameras
 from mvsgs_core.export.keyframe_images import image_name, there
-
-_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+from mvsgs_core.geometry import OPENGL_FROM_OPENCV
 
 
 def write_transforms(path: Path, cameras: Cameras, images: Path) -> int:
@@ -34,7 +31,7 @@ def write_transforms(path: Path, cameras: Cameras, images: Path) -> int:
             {
                 "file_path": f"{folder}/{name}", "w": width, "h": height, "fl_x": fx, "fl_y": fy,
                 "cx": cx + 0.5, "cy": cy + 0.5,
-                "transform_matrix": (cameras.world_from_cam[k] @ _OPENCV_FROM_OPENGL).tolist(),
+                "transform_matrix": (cameras.world_from_cam[k] @ OPENGL_FROM_OPENCV).tolist(),
             }
         )  # fmt: skip
     text = json.dumps({"camera_model": "OPENCV", "frames": frames}, allow_nan=False)

@@ -21,10 +21,9 @@ class NativeFusionBackend:
     def parallax(self, maps: DepthMaps) -> np.ndarray:
         return np.asarray(self._kernels.parallax(maps.depth, maps.neighbor_depths, maps.there, self._threads))
 
-    def consistent_views(self, maps: DepthMaps, relative: np.ndarray, pixels: float, round_trip: bool) -> np.ndarray:
-        options = self._kernels.ConsistencyOptions(pixels, round_trip, self._threads)
+    def consistent_views(self, maps: DepthMaps, relative: np.ndarray) -> np.ndarray:
         return np.asarray(
-            self._kernels.consistent_views(maps.depth, maps.neighbor_depths, maps.there, maps.back, relative, options)
+            self._kernels.consistent_views(maps.depth, maps.neighbor_depths, maps.there, relative, self._threads)
         )
 
     def splat(self, maps: DepthMaps, options: FuseOptions) -> np.ndarray:

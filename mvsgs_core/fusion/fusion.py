@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,7 +12,7 @@ from mvsgs_core.fusion.confidence import features_of, probability_of_inlier, unc
 from mvsgs_core.fusion.interface import FuseOptions, FusionBackend
 from mvsgs_core.fusion.keyframe_depth import KeyframeDepth, depth_maps
 from mvsgs_core.fusion.normals import normals_of
-from mvsgs_core.keyframe_window import Correction, KeyframeWindow
+from mvsgs_core.keyframe_window import WindowedStage
 from mvsgs_core.pace import Effort, Pace
 
 ANY_DEPTH = 1.0  # relative difference that no two positive depths reach
@@ -35,8 +34,6 @@ class FusionConfig:
     min_neighbor_confidence: float = 0.1
     check: bool = True  # geometric consistency
     relative: float = 0.02  # relative depth difference that still agrees; refined, the support's width if that is more
-    round_trip: bool = False  # check by projecting back, instead of the paper's one way
-    pixels: float = 1.0  # round trip: distance to where it started
     min_views: int = 2  # views that must agree, the reference counted; 1: its own depth will do
     confidence: float = 0.755  # of a kept pixel at least: lower keeps more, with more outliers
     device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
@@ -62,47 +59,18 @@ class FusedDepth:
     effort: int = 0  # of `EFFORTS`
 
 
-class OnlineFusion:
-    """Feeds on depth maps in stream order; `add` and `flush` yield each keyframe's exactly once, in order."""
+class OnlineFusion(WindowedStage[KeyframeDepth, FusedDepth]):
+    """Fused depth of each keyframe."""
 
     def __init__(self, config: FusionConfig | None = None) -> None:
-        self.config = config or FusionConfig()
-        self._backend = make_fusion_backend(self.config.device, self.config.threads)
-        self._window = KeyframeWindow[KeyframeDepth](self.config.window, self.config.lag)
-        c = self.config
+        self.config = c = config or FusionConfig()
+        super().__init__(c.window, c.lag)
+        self._backend = make_fusion_backend(c.device, c.threads)
         fewer = replace(c, neighbors=min(2, c.neighbors))
         self._ways = (c, fewer, replace(c, neighbors=0, check=False))  # one an effort
         self.pace = Pace(EFFORTS, c.share, only=c.efforts if c.realtime else (0,))
 
-    def add(self, view: KeyframeDepth) -> Iterator[FusedDepth]:
-        """Fused depth of the keyframe `lag` before this one; of all that wait if a new segment or size starts."""
-        for reference, others in self._window.add(view):
-            yield self._fused(reference, others)
-
-    def release(self) -> Iterator[FusedDepth]:
-        """Fused depth of the keyframe that has waited longest, though fewer than `lag` came after it."""
-        for reference, others in self._window.release():
-            yield self._fused(reference, others)
-
-    def flush(self) -> Iterator[FusedDepth]:
-        """Fused depth of the keyframes that still wait."""
-        for reference, others in self._window.flush():
-            yield self._fused(reference, others)
-
-    def forget(self) -> None:
-        """The keyframes that come next are of another map. None waits: see `flush`."""
-        self._window = KeyframeWindow[KeyframeDepth](self.config.window, self.config.lag)
-
-    @property
-    def waiting(self) -> int | None:
-        """Index of the keyframe that has waited longest for later ones."""
-        return self._window.waiting
-
-    def move(self, poses: dict[int, Correction]) -> None:
-        """Corrections by keyframe index: stored depths are scaled with them."""
-        self._window.move(poses)
-
-    def _fused(self, reference: KeyframeDepth, others: list[KeyframeDepth]) -> FusedDepth:
+    def _result(self, reference: KeyframeDepth, others: list[KeyframeDepth]) -> FusedDepth:
         with self.pace.spend() as effort:
             found = self._fuse(reference, others, self._ways[effort])
         return replace(found, effort=effort)
@@ -178,13 +146,13 @@ def fuse(
             within = np.clip(doubt, config.relative, max(config.relative, config.sigma_most))
         doubtful = np.array([n.doubtful(config.min_neighbor_confidence) for n in neighbors])
         certain = maps.of(~doubtful)
-        consistent = backend.consistent_views(certain, within, config.pixels, config.round_trip)
+        consistent = backend.consistent_views(certain, within)
         if config.refine:
-            seeing = backend.consistent_views(certain, np.full_like(depth, ANY_DEPTH), config.pixels, False)
+            seeing = backend.consistent_views(certain, np.full_like(depth, ANY_DEPTH))
             evidence = features_of(fused, confidence, consistent, seeing, doubt)
             confidence = np.where(depth > 0, probability_of_inlier(evidence), 0.0).astype(np.float32)
         if doubtful.any():  # such a map may agree, and is not heard where it does not
-            consistent += backend.consistent_views(maps.of(doubtful), within, config.pixels, config.round_trip)
+            consistent += backend.consistent_views(maps.of(doubtful), within)
     if reference.mask is not None:  # the neighbors may well see what is behind there
         depth = np.where(reference.mask, depth, np.float32(0))
     keep = depth > 0

@@ -52,12 +52,11 @@ class FusionBackend(Protocol):
         The root of the sum of squares over the neighbors in whose image the point falls; 0 where depth is unknown.
         """
 
-    def consistent_views(self, maps: DepthMaps, relative: np.ndarray, pixels: float, round_trip: bool) -> np.ndarray:
+    def consistent_views(self, maps: DepthMaps, relative: np.ndarray) -> np.ndarray:
         """(H, W) uint8: neighbors that agree with the reference's depth.
 
         MVS-GS, geometric consistency: the reference's point, projected into the neighbor, against the depth there,
-        within `relative` (H, W) float32 of the larger of both. With `round_trip` (MVSFormer): that depth, projected
-        back, must come within `pixels` of where it started, and its depth within `relative`.
+        within `relative` (H, W) float32 of the larger of both.
         """
 
     def splat(self, maps: DepthMaps, options: FuseOptions) -> np.ndarray:

@@ -13,7 +13,7 @@ from mvsgs_core.devices import torch_device
 from mvsgs_core.fusion.fusion import FusionConfig, OnlineFusion
 from mvsgs_core.fusion.keyframe_depth import KeyframeDepth
 from mvsgs_core.networks import checkpoints
-from mvsgs_core.networks.vfuse import FusionInput, VFuse, check_choices
+from mvsgs_core.networks.vfuse import FusionInput, VFuse, check_center
 
 _INSIDE = "model_state_dict"  # key of the state dict in the published files
 _PERCENTILES, _MARGIN = (1.0, 99.0), 1.1  # of the known depths, for the range that the network normalizes by
@@ -25,7 +25,6 @@ class VFuseConfig(FusionConfig):
 
     weights: str | None = None  # checkpoint; null: where mvsgs_core.weights finds it; random: untrained, for tests
     center: Literal["conf", "mean"] = "conf"  # of a pixel's search window: the most confident depth, the weighted mean
-    confidence_mode: Literal["swr", "single", "pns", "pns_swr", "pkrn"] = "swr"  # see networks.vfuse_confidence
 
 
 def check_weights(file: str | None) -> None:
@@ -34,11 +33,11 @@ def check_weights(file: str | None) -> None:
 
 
 class LearnedOnlineFusion(OnlineFusion):
-    """Raises ValueError for an unknown center or confidence mode, and what `checkpoints.make` raises."""
+    """Raises ValueError for an unknown center, and what `checkpoints.make` raises."""
 
     def __init__(self, config: VFuseConfig) -> None:
         super().__init__(replace(config, refine=False))
-        check_choices(config.center, config.confidence_mode)
+        check_center(config.center)
         self._learned = config
         self._net = checkpoints.make(VFuse, "vfuse", config.weights, inside=_INSIDE)
         self._net.to(torch_device(config.device))
@@ -55,7 +54,7 @@ class LearnedOnlineFusion(OnlineFusion):
 def refine(
     net: VFuse, reference: KeyframeDepth, neighbors: list[KeyframeDepth], config: VFuseConfig
 ) -> tuple[KeyframeDepth, int]:
-    """The reference with V-FUSE's depth and confidence (what it means: networks.vfuse_confidence), and how many pixels
+    """The reference with V-FUSE's depth and confidence (what it means: networks.vfuse), and how many pixels
     have none because one of both was not finite."""
     views, device = [reference, *neighbors], torch_device(config.device)
     depths = np.stack([v.depth for v in views]).astype(np.float32)
@@ -72,7 +71,7 @@ def refine(
         near=float(low / _MARGIN),
         far=float(high * _MARGIN),
     )
-    fused = net(given, config.center, confidence=config.confidence_mode)
+    fused = net(given, config.center)
     depth, confidence = fused.depth.cpu().numpy() * np.float32(unit), fused.confidence.cpu().numpy()
     finite = np.isfinite(depth) & np.isfinite(confidence)
     good = finite & (depth > 0) & (confidence >= 0)

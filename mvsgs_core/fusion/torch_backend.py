@@ -27,22 +27,16 @@ class TorchFusionBackend(TorchTwin):
         return squares.sqrt().cpu().numpy()
 
     @torch.no_grad()
-    def consistent_views(self, maps: DepthMaps, relative: np.ndarray, pixels: float, round_trip: bool) -> np.ndarray:
+    def consistent_views(self, maps: DepthMaps, relative: np.ndarray) -> np.ndarray:
         z, within = self._on(maps.depth), self._on(relative)
         u, v = _pixels(z.shape, self.device)
         count = torch.zeros(z.shape, dtype=torch.uint8, device=self.device)
-        for map_, there, home in zip(self._on(maps.neighbor_depths), self._on(maps.there), self._on(maps.back)):
+        for map_, there in zip(self._on(maps.neighbor_depths), self._on(maps.there)):
             x, y, seen_depth, front = _project(there, u, v, z)
             at, inside = _nearest(x, y, map_.shape)
             found = map_.reshape(-1)[at]
             agree = (z > 0) & front & inside & (found > 0)
-            if round_trip:
-                width = map_.shape[1]
-                here_x, here_y, here_depth, ahead = _project(home, (at % width).float(), (at // width).float(), found)
-                near = (here_x - u) ** 2 + (here_y - v) ** 2 < pixels**2
-                agree &= ahead & near & ((here_depth - z).abs() < within * torch.maximum(here_depth, z))
-            else:
-                agree &= (found - seen_depth).abs() < within * torch.maximum(found, seen_depth)
+            agree &= (found - seen_depth).abs() < within * torch.maximum(found, seen_depth)
             count += agree.to(torch.uint8)
         return count.cpu().numpy()
 

@@ -43,8 +43,3 @@ class Background:
         known."""
         known = self._colors[: len(self._rows)]
         return known.mean(axis=0).astype(np.float32) if len(known) else None
-
-
-def background_of(views: Sequence[TrainingView]) -> np.ndarray | None:
-    """As `Background.color`."""
-    return Background(views).color

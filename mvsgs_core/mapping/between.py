@@ -80,18 +80,16 @@ class BetweenView(TrainingView):
     def follow(self, keyframe: TrainingView, frame: FrameOfReference) -> None:
         """Stands beside the keyframe where that stands now, in its light, the map's own step of its pose included."""
         change = keyframe.scale / self.scale
-        self.keyframe_from_cam = scaled(self.keyframe_from_cam, change)
-        self.twist = in_unit(self.twist, 1.0 / change)
-        self.velocity = in_unit(self.twist, frame.length)
+        self.keyframe_from_cam = geometry.scaled(self.keyframe_from_cam, change)
+        self.twist = geometry.twist_scaled(self.twist, change)
+        self.velocity = geometry.twist_scaled(self.twist, 1.0 / frame.length)
         self.scale = keyframe.scale
         self.world_from_cam = keyframe.world_from_cam @ self.keyframe_from_cam
         local = keyframe.local_from_cam
-        relative = scaled(self.keyframe_from_cam, 1.0 / frame.length)
+        relative = geometry.scaled(self.keyframe_from_cam, 1.0 / frame.length)
         self.local_from_cam = local @ relative
         self.pose_delta = geometry.inverse(relative) @ keyframe.pose_delta @ relative
-        self.measured = None if keyframe.measured is None else compose(self.from_keyframe, keyframe.measured)
-        exposure = compose(self.from_keyframe, keyframe.exposure.detach().cpu().numpy())
-        self.exposure = torch.as_tensor(exposure, dtype=torch.float32, device=self.exposure.device)
+        self.take_exposure(None if keyframe.measured is None else compose(self.from_keyframe, keyframe.measured))
 
 
 def between_view(
@@ -129,18 +127,6 @@ def between_view(
         log.refuse("views", 1, "a frame between keyframes far away from them was refused")
         return None
     return view
-
-
-def scaled(pose: np.ndarray, factor: float) -> np.ndarray:
-    """The pose (4, 4), its lengths multiplied."""
-    moved = pose.copy()
-    moved[:3, 3] *= factor
-    return moved
-
-
-def in_unit(twist: np.ndarray, unit: float) -> np.ndarray:
-    """The twist (6,), its lengths in this unit."""
-    return twist / np.repeat([unit, 1.0], 3)
 
 
 __all__ = ["BetweenView", "FrameBetween", "FramesBetween", "between_view"]

@@ -1,30 +1,12 @@
-"""Adam on what belongs to a keyframe's camera and not to the map: its color affine and its pose."""
+"""Adam on what belongs to a keyframe's camera and not to the map: its pose."""
 
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from mvsgs_core import geometry
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.optimizer import BETA_1, BETA_2
-
-
-@torch.no_grad()
-def step_exposure(view: TrainingView, rate: float) -> None:
-    """Adam on the color affine of a keyframe that has a measured one, drawn toward that."""
-    gradient = view.exposure.grad
-    view.exposure.grad = None
-    view.exposure.requires_grad_(False)
-    if gradient is None or view.measured is None or not bool(torch.isfinite(gradient).all()):
-        return
-    gradient = gradient + 1e-3 * (view.exposure - torch.as_tensor(view.measured, device=view.exposure.device))
-    first, second = view.exposure_moments
-    steps = view.visits
-    first.mul_(BETA_1).add_(gradient, alpha=1 - BETA_1)
-    second.mul_(BETA_2).addcmul_(gradient, gradient, value=1 - BETA_2)
-    mean, square = first / (1 - BETA_1**steps), second / (1 - BETA_2**steps)
-    view.exposure -= rate * mean / (square.sqrt() + 1e-8)
 
 
 def step_pose(view: TrainingView, gradient: np.ndarray, angle: float, length: float) -> bool:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -15,33 +13,8 @@ from mvsgs_core.rasterizer.sh_rotation import sh_rotation
 CHUNK = 16384  # splats that are moved at once: matrices in float64 for each take three times what the map keeps of it
 
 
-@dataclass(frozen=True)
-class Similarity:
-    """X' = scale * rotation @ X + translation, float64, in the mapper's frame."""
-
-    scale: float
-    rotation: np.ndarray  # (3, 3)
-    translation: np.ndarray  # (3,)
-
-    @classmethod
-    def between(cls, old: np.ndarray, new: np.ndarray, scale: float) -> Similarity:
-        """What was seen from pose `old` (4, 4), its depths multiplied by `scale`, and put at pose `new`."""
-        rotation = new[:3, :3] @ old[:3, :3].T
-        return cls(scale, rotation, new[:3, 3] - scale * rotation @ old[:3, 3])
-
-    def moves(self, length: float, tolerance: float = 1e-6) -> bool:
-        """Whether a point within `length` moves by more than `tolerance` of it."""
-        change = abs(self.scale - 1.0) + float(np.abs(self.rotation - np.eye(3)).max())
-        return change + float(np.abs(self.translation).max()) / length > tolerance
-
-    def shifts(self, points: np.ndarray) -> np.ndarray:
-        """Distances (N,) by which points (N, 3) move."""
-        moved = self.scale * points @ self.rotation.T + self.translation
-        return np.asarray(np.linalg.norm(moved - points, axis=1))
-
-
 @torch.no_grad()
-def move_with_anchors(state: MapState, similarities: dict[int, Similarity]) -> int:
+def move_with_anchors(state: MapState, similarities: dict[int, geometry.Similarity]) -> int:
     """Moves all splats whose anchor is a key; returns their number.
 
     Positions, standard deviations, orientations and spherical harmonics follow. The moments follow the change of
@@ -61,7 +34,7 @@ def move_with_anchors(state: MapState, similarities: dict[int, Similarity]) -> i
     return len(chosen)
 
 
-def _move(state: MapState, chosen: Tensor, which: Tensor, ordered: list[Similarity]) -> None:
+def _move(state: MapState, chosen: Tensor, which: Tensor, ordered: list[geometry.Similarity]) -> None:
     """Moves the splats `chosen` (M,), in place, each by the similarity `which` (M,) of `ordered`."""
     rotations = np.stack([s.rotation for s in ordered])
     scale = _rows([s.scale for s in ordered], which)

@@ -46,7 +46,7 @@ class Densifier:
         size = view.size
         image = view.target.cpu().numpy()
         valid = np.ones(size, dtype=bool) if view.valid is None else view.valid.cpu().numpy()
-        residual, shown, noise = self._residual(view, image)
+        residual, shown, noise = self._residual(view, image, valid)
         near = self._near(depth / np.float32(self.frame.length))
         depth = _nearest(near, size)
         known = wanted = (depth > 0) & valid
@@ -70,13 +70,15 @@ class Densifier:
         points = points_of_rectangles(parts, depth, known, confidence, view.intrinsics, colors, normals)
         return self._append(points, view)
 
-    def _residual(self, view: TrainingView, image: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    def _residual(
+        self, view: TrainingView, image: np.ndarray, valid: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, float]:
         """Squared error (H, W), mean over RGB, of what the map shows of an image, its depth there, 0: nothing, and the
         variance of the image's noise, 0 where there is no map.
 
         The error counts beyond `median_errors` times the median alone: that is what blur, noise, exposure and a pose's
         error do to this view, which no splat mends. On a clean view it is small, and detail that the map lacks stands
-        out.
+        out. What is usual is asked of `valid` pixels (H, W): behind a mask the photograph shows something else.
         """
         residual, shown = np.full(view.size, EMPTY, dtype=np.float32), np.zeros(view.size, dtype=np.float32)
         if not len(self.state):
@@ -86,10 +88,11 @@ class Densifier:
         opacity = render.opacity.cpu().numpy()
         shown = np.where(opacity > SOLID, render.depth.cpu().numpy(), np.float32(0))
         mapped = opacity >= self.config.min_opacity
-        if self.config.unexplored and mapped.any():
+        compared = mapped & valid
+        if self.config.unexplored and compared.any():
             squared = np.mean((render.color.cpu().numpy() - image) ** 2, axis=-1)
-            usual = np.median(squared[mapped])
-            noise = noise_variance(squared[mapped])
+            usual = np.median(squared[compared])
+            noise = noise_variance(squared[compared])
             beyond = squared - self.config.median_errors**2 * usual
             residual[mapped] = np.maximum(beyond, 0.0)[mapped]
         return residual, shown, noise

@@ -62,7 +62,7 @@ class ImageFormation:
         factor = None
         if self.vignetting is not None:
             factor = vignetting_factor(self.vignetting, view.intrinsics_at(size), size)
-        return colors_of_map(colors, view.exposure.detach().cpu().numpy(), factor)
+        return colors_of_map(colors, view.exposure.cpu().numpy(), factor)
 
     def copy(self) -> ImageFormation:
         """One that later changes do not reach; the arrays never change."""

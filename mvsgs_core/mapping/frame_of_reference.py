@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mvsgs_core.mapping.deformation import Similarity
+from mvsgs_core.geometry import Similarity
 
 FAR = 1e6  # median depths from the origin, and between scales: float32 has no detail left there
 MAX_DEPTH = 1e18  # in the world's unit: squares of it are finite in float32

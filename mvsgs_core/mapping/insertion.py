@@ -14,7 +14,7 @@ import torch
 from mvsgs_core import camera
 from mvsgs_core.mapping.partition import Partition
 from mvsgs_core.rasterizer.kernels import neutral_beta
-from mvsgs_core.rasterizer.spherical_harmonics import C0
+from mvsgs_core.rasterizer.spherical_harmonics import from_rgb
 from mvsgs_core.rasterizer.splats import Splats
 
 MIN_COSINE = 0.25  # between ray and normal: a surface seen more slantingly is not stretched further
@@ -142,7 +142,7 @@ def splats_from_points(
     scales = config.initial_scale * np.column_stack([deviations, thickness])
     opacity = min(max(config.initial_opacity, 1e-4), 1.0 - 1e-4)
     sh = np.zeros((count, sh_bases, 3))
-    sh[:, 0] = (points.colors - 0.5) / C0
+    sh[:, 0] = from_rgb(points.colors)
     return Splats(
         means=_tensor(points.positions @ rotation.T + translation),
         log_scales=_tensor(np.log(np.maximum(scales, 1e-30))),

@@ -12,7 +12,7 @@ from mvsgs_core.mapping.background import Background
 from mvsgs_core.mapping.between import BetweenView
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.owed import Owed
-from mvsgs_core.mapping.resting_images import rest, room_of
+from mvsgs_core.mapping.resting_images import bytes_of, rest, room_of
 from mvsgs_core.mapping.thinning import closest
 from mvsgs_core.stats import Stats
 
@@ -64,7 +64,7 @@ class KeyframeStore:
     @property
     def image_bytes(self) -> int:
         """Of the images in memory, and their masks: what grows with the length of a run, to a bound."""
-        return sum(_bytes(view) for view in self.trained if not view.image_on_disk)
+        return sum(bytes_of(view) for view in self.trained if not view.image_on_disk)
 
     @property
     def trained(self) -> list[TrainingView]:
@@ -147,11 +147,11 @@ class KeyframeStore:
         """The oldest images beyond go to disk, with their masks, and of a GPU's those beyond its `room_of`; where the
         disk is full, they stay."""
         waking = sorted((view for view in self.trained if not view.image_on_disk), key=lambda view: view.index)
-        room, held = room_of(waking[-1].image.device) if waking else math.inf, sum(map(_bytes, waking))
+        room, held = room_of(waking[-1].image.device) if waking else math.inf, sum(map(bytes_of, waking))
         for place, view in enumerate(waking):
             if len(waking) - place <= in_memory and held <= room:
                 return
-            held -= _bytes(view)
+            held -= bytes_of(view)
             if not rest(view, self._log):
                 return
 
@@ -159,7 +159,3 @@ class KeyframeStore:
 def awake(in_memory: int, window: int) -> int:
     """How many images do not wait on disk: what `images_in_memory` says, and the newest keyframes' in any case."""
     return max(in_memory, window)
-
-
-def _bytes(view: TrainingView) -> int:
-    return view.image.numel() + (0 if view.valid is None else view.valid.numel())

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mvsgs_core import camera
-from mvsgs_core.mapping.deformation import Similarity
+from mvsgs_core.geometry import Similarity
 from mvsgs_core.photometry import IDENTITY, compose, inverse
 
 
@@ -61,9 +61,8 @@ class TrainingView:
     world_from_cam: np.ndarray  # (4, 4) float64, world units
     scale: float
     local_from_cam: np.ndarray  # (4, 4) float64, in the mapper's frame and unit
-    exposure: Tensor  # (3, 4) color affine [A | b] that it is rendered with, the identity where none is measured
-    exposure_moments: tuple[Tensor, Tensor]
-    measured: np.ndarray | None = None  # (3, 4) the tracker's, which the exposure is near; None: there is none
+    exposure: Tensor  # (3, 4) color affine [A | b] that it is rendered with: `measured`, or the identity
+    measured: np.ndarray | None = None  # (3, 4) the tracker's; None: there is none
     pose_delta: np.ndarray = field(default_factory=lambda: np.eye(4))  # (4, 4) from the tracker's camera to the refined
     pose_moments: np.ndarray = field(default_factory=lambda: np.zeros((2, 6)))  # of (translation, rotation)
     pose_steps: int = 0
@@ -169,16 +168,16 @@ class TrainingView:
         return moved
 
     def expose(self, measured: np.ndarray | None) -> np.ndarray:
-        """A corrected exposure (3, 4), None: none any more; returns the affine (3, 4) its map colors take.
-
-        What was trained beside the old one stays beside the new one, so that the keyframe's own splats look as before.
-        """
+        """A corrected exposure (3, 4), None: none any more; returns the affine (3, 4) its map colors take, so that
+        its own splats look as before."""
         old = IDENTITY if self.measured is None else self.measured
         change = compose(inverse(IDENTITY if measured is None else measured), old)
-        now = IDENTITY if measured is None else compose(self.exposure.detach().cpu().numpy(), inverse(change))
-        self.exposure = torch.as_tensor(now, dtype=torch.float32, device=self.exposure.device)
-        self.measured = measured
+        self.take_exposure(measured)
         return change
+
+    def take_exposure(self, measured: np.ndarray | None) -> None:
+        """Rendered with it, (3, 4), from here on; None: with the identity."""
+        self.exposure, self.measured = exposure_of(measured, self.exposure.device), measured
 
     def record(self, loss: float) -> None:
         """Takes in the loss of an iteration."""
@@ -221,7 +220,6 @@ def training_view(
     if keyframe.mask is not None:
         valid = keyframe.mask if valid is None else valid & keyframe.mask
     valid = camera.mask_at(valid, size)
-    identity = torch.eye(3, 4, device=device)
     resized = np.array(camera.resize_image(image, size))
     return TrainingView(
         index=keyframe.index,
@@ -233,11 +231,15 @@ def training_view(
         world_from_cam=np.asarray(keyframe.world_from_cam, dtype=np.float64),
         scale=keyframe.scale,
         local_from_cam=local_from_cam,
-        exposure=identity.clone(),
-        exposure_moments=(torch.zeros_like(identity), torch.zeros_like(identity)),
+        exposure=exposure_of(None, device),
         valid=None if valid is None else torch.from_numpy(valid.copy()).to(device),  # messages are read-only
         mean_color=mean_color(resized, valid),
     )
+
+
+def exposure_of(measured: np.ndarray | None, device: torch.device) -> Tensor:
+    """(3, 4) float32 that a view of this measured exposure is rendered with."""
+    return torch.tensor(IDENTITY if measured is None else measured, dtype=torch.float32, device=device)
 
 
 def mean_color(image: np.ndarray, valid: np.ndarray | None) -> np.ndarray:

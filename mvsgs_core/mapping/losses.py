@@ -5,8 +5,8 @@ mask. The mask comes from a difference of Gaussians of the render, whose width m
 `frequency` in 0 to 100: in the first half the smooth regions are kept (the mask is inverted), in the second the edges.
 An online run, whose length is not known ahead, gives each view its own progress until the stream ends.
 
-One more term: its weight in `LossWeights`, its function in `TERMS`, or in `SPLAT_TERMS`. Another loss altogether, in a
-file of one's own or in a program: `training.loss_function`, a function of `LossInputs`.
+One more term: its weight in `LossWeights`, its function in `TERMS`. Another loss altogether, in a file of one's own or
+in a program: `training.loss_function`, a function of `LossInputs`.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def weights_of(loss: Loss, chosen: LossWeights) -> dict[str, float]:
 
 def training_loss(inputs: LossInputs, weights: dict[str, float]) -> Tensor:
     """The sum of all terms, a scalar."""
-    parts = [part for term in (*TERMS, *SPLAT_TERMS) if (part := term(inputs, weights)) is not None]
+    parts = [part for term in TERMS if (part := term(inputs, weights)) is not None]
     return sum(parts[1:], start=parts[0])
 
 
@@ -187,10 +187,9 @@ def photometric_loss(inputs: LossInputs, weights: dict[str, float]) -> Tensor:
 
 def only_photometric(weights: dict[str, float]) -> bool:
     """Whether the loss is L1 and SSIM alone, which `photograph_loss` makes of the photograph at once."""
-    return TERMS[0] is photometric_loss and len(TERMS) == 1 and not SPLAT_TERMS and weights["frequency"] == 0.0
+    return TERMS[0] is photometric_loss and len(TERMS) == 1 and weights["frequency"] == 0.0
 
 
 # Each gives its part of the sum, weighted: a scalar; None where its weight is 0. The first is never None.
 Term = Callable[[LossInputs, dict[str, float]], Tensor | None]
 TERMS: tuple[Term, ...] = (photometric_loss,)
-SPLAT_TERMS: tuple[Term, ...] = ()  # whose gradients go to the splats themselves, past the render

@@ -9,12 +9,13 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from mvsgs_core import geometry
 from mvsgs_core.devices import resolve_device
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.mapping.between import BetweenView, FrameBetween, between_view
 from mvsgs_core.mapping.coarse import LATER, CoarseKeyframes
 from mvsgs_core.mapping.config import MapperConfig
-from mvsgs_core.mapping.deformation import Similarity, move_with_anchors
+from mvsgs_core.mapping.deformation import move_with_anchors
 from mvsgs_core.mapping.densifier import Densifier, checked_depth
 from mvsgs_core.mapping.exposure import ImageFormation, recolor_with_anchors
 from mvsgs_core.mapping.frame_of_reference import FrameOfReference
@@ -136,7 +137,7 @@ class OnlineMapper:
         view.as_taken = keyframe.photograph is None and keyframe.velocity is None
         if checked.photograph is not None and checked.velocity is not None and view.has_image:
             per_unit = scale / (checked.scale * self.frame.length)
-            velocity = checked.velocity * ([per_unit] * 3 + [1.0] * 3)
+            velocity = geometry.twist_scaled(checked.velocity, per_unit)
             view.take_photograph(checked.photograph, velocity, checked.readout_time, checked.reads_columns)
         self.schedule.add_budget(self.config.budget)
         self.log.count("inserted", inserted)
@@ -259,7 +260,7 @@ class OnlineMapper:
         Splats move with their anchor keyframe; returns how many did. A keyframe of which what it sees moves by more
         than a pixel is trained until its loss is back, see `step`. Poses that are not finite are refused and counted.
         """
-        moved: dict[int, Similarity] = {}
+        moved: dict[int, geometry.Similarity] = {}
         for key, pose, s in zip(index.tolist(), np.asarray(world_from_cam, dtype=np.float64), scale.tolist()):
             if not is_pose(pose, s) or not self.frame.holds(pose):
                 self.log.refuse("poses", 1, NO_POSE)
@@ -289,7 +290,7 @@ class OnlineMapper:
         whether that was known of them before or not, and for the frames between them, whose velocities stay. A readout
         time of 0 holds for all keyframes, as poses are those of a camera without one then.
         """
-        known = dict(zip(index.tolist(), velocity / np.repeat([self.frame.length, 1.0], 3)))
+        known = dict(zip(index.tolist(), geometry.twist_scaled(velocity, 1.0 / self.frame.length)))
         for view in self.views:
             found = known.get(view.index)
             if view.as_taken and found is not None and np.isfinite(found).all():

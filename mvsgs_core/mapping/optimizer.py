@@ -133,8 +133,10 @@ def step_reference(state: MapState, visible: Tensor, steps: list[Group], decay_s
         taken &= torch.isfinite(gradient.abs().sum(dim=1))
     refused = visible & ~taken
     state.steps += taken.to(torch.int32)
-    age = state.steps.to(torch.float64).clamp(min=1)[:, None]  # float32 would lose 1 - beta^age
-    progress = (age / max(decay_steps, 1)).clamp(max=1.0)
+    age = state.steps.to(torch.float64).clamp(min=1)[:, None]
+    progress = (age / max(decay_steps, 1)).clamp(max=1.0).float()
+    # float32 would lose 1 - beta^age; all else is in it, as in the kernel: most GPUs take 64 times as long for float64
+    correction_1, correction_2 = ((1.0 / (1.0 - beta**age)).float() for beta in (BETA_1, BETA_2))
     for group in active:
         parameter: Tensor = getattr(state.splats, group.name)
         value = parameter.detach().reshape(len(state), -1)
@@ -146,9 +148,9 @@ def step_reference(state: MapState, visible: Tensor, steps: list[Group], decay_s
         rate = group.rate * (group.final_rate / group.rate) ** progress if group.rate > 0 else 0.0
         column = torch.arange(value.shape[1], device=value.device)
         rate = rate * torch.where(column < group.lead, 1.0, group.tail)
-        update = rate * (m / (1 - BETA_1**age)) / ((v / (1 - BETA_2**age)).sqrt() + EPSILON)
+        update = rate * (m * correction_1) / ((v * correction_2).sqrt() + EPSILON)
         low, high = value.clamp(max=group.low), value.clamp(min=group.high)
-        stepped = torch.minimum(torch.maximum(value - update, low), high).to(value.dtype)
+        stepped = torch.minimum(torch.maximum(value - update, low), high)
         finite = torch.isfinite(stepped.abs().sum(dim=1) + m.abs().sum(dim=1) + v.sum(dim=1))
         refused |= taken & ~finite
         rows = (taken & finite)[:, None]

@@ -11,8 +11,9 @@ import torch
 from mvsgs_core.export.ply import folded
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.rasterizer.interface import Render, as_bytes
 from mvsgs_core.rasterizer.reference import rotation_matrices
-from mvsgs_core.rasterizer.spherical_harmonics import C0
+from mvsgs_core.rasterizer.spherical_harmonics import to_rgb
 from mvsgs_core.rasterizer.splats import Splats
 
 DEPTH_WIDTH = 320  # pixels of the depth map at most: it is for the eye
@@ -35,7 +36,7 @@ def preview_arrays(mapper: OnlineMapper, limit: int, provisional: Splats | None 
     whole = thinned(mapper.state.detached(), limit - (0 if provisional is None else len(provisional))).tensors()
     if provisional is not None:
         whole = {name: torch.cat([value, getattr(provisional, name).to(value)]) for name, value in whole.items()}
-    shown = folded(Splats(**whole), mapper.config.training.kernel).tensors()  # browsers know only Gaussians
+    shown = folded(Splats(**whole), mapper.config.training.kernel)  # browsers know only Gaussians
     keyframes = np.array([view.index for view in mapper.views], dtype=np.int64)
     poses = np.stack([view.world_from_cam for view in mapper.views])
     poses[:, :3, 3] -= origin
@@ -44,10 +45,7 @@ def preview_arrays(mapper: OnlineMapper, limit: int, provisional: Splats | None 
         "iterations": mapper.iterations,
         "world_from_cam": poses[-1],
         **seen(mapper, newest),
-        "means": (shown["means"] * unit).cpu().numpy(),
-        "covariances": covariances(shown["quaternions"], shown["log_scales"], unit).cpu().numpy(),
-        "colors": as_bytes(0.5 + C0 * shown["sh"][:, 0]),
-        "opacities": torch.sigmoid(shown["opacity_logits"]).cpu().numpy(),
+        **gaussian_arrays(shown, unit),
         "keyframes": keyframes,
         "splats": splats_by_keyframe(mapper.state.anchors.cpu().numpy(), keyframes),
         "keyframe_poses": poses,
@@ -72,13 +70,29 @@ def seen(mapper: OnlineMapper, view: TrainingView) -> dict[str, np.ndarray]:
     a pixel.
     """
     render = mapper.render(view)
-    depth = torch.where(render.opacity > 0.5, render.depth * mapper.frame.length, 0.0)
+    depth = known_depth(render) * mapper.frame.length
     step = -(-depth.shape[1] // DEPTH_WIDTH)
     return {
         "intrinsics": view.intrinsics,
         "image": view.image.cpu().numpy(),
         "render": as_bytes(render.color),
         "depth": np.ascontiguousarray(depth[step // 2 :: step, step // 2 :: step].float().cpu().numpy()),
+    }
+
+
+def known_depth(render: Render) -> torch.Tensor:
+    """(H, W), 0 where the map covers less than half of a pixel."""
+    return torch.where(render.opacity > 0.5, render.depth, 0.0)
+
+
+def gaussian_arrays(splats: Splats, unit: float = 1.0) -> dict[str, np.ndarray]:
+    """What a browser shows of Gaussians, in a unit of so many world units: `means` (N, 3), `covariances` (N, 3, 3),
+    both in world units, `colors` (N, 3) uint8, `opacities` (N,)."""
+    return {
+        "means": (splats.means * unit).cpu().numpy(),
+        "covariances": covariances(splats.quaternions, splats.log_scales, unit).cpu().numpy(),
+        "colors": as_bytes(to_rgb(splats.sh[:, 0])),
+        "opacities": torch.sigmoid(splats.opacity_logits).cpu().numpy(),
     }
 
 
@@ -95,8 +109,3 @@ def covariances(quaternions: torch.Tensor, log_scales: torch.Tensor, unit: float
         axes = rotation_matrices(q) * (s.exp() * unit)[:, None, :]
         made.append(axes @ axes.transpose(1, 2))
     return torch.cat(made)
-
-
-def as_bytes(color: torch.Tensor) -> np.ndarray:
-    """Of values from 0 to 1; what is beyond is cut."""
-    return np.asarray((color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy())

@@ -92,7 +92,6 @@ def removal_cost(
         counted = valid.to(state.device, torch.float32)
         photograph = image.color.detach().clamp(0.0, 1.0)  # which is cut off where the color is brighter than white
         error += float((counted[..., None] * (photograph - view.target) ** 2).sum(dtype=torch.float64))
-        seen += image.visible
         weight = torch.maximum(weight, image.weight_max.detach())
         for _ in range(probes):
             drawn = torch.randint(0, 2, image.color.shape, generator=generator, dtype=torch.int8)
@@ -101,6 +100,8 @@ def removal_cost(
             signed = (image.color * (counted[..., None] * signs)).sum()
             (slope,) = torch.autograd.grad(signed, [leaf], retain_graph=True)
             total += (slope / (1.0 - opacity)).to(torch.float64) ** 2 / probes  # dC/dlogit = o (1 - o) dC/do
+        # an image says nothing of what only its mask covers
+        seen += image.visible if view.valid is None else image.visible & (slope != 0)
         del image, signed, slope  # with what the rasterizer keeps for them, which the next view takes over
     shown = (seen > 0) & (weight >= HIDDEN * opacity)
     cost = total * len(views) / seen.clamp(min=1.0)

@@ -92,4 +92,9 @@ def room_of(device: torch.device) -> float:
     return float(torch.cuda.get_device_properties(device).total_memory) / 4
 
 
-__all__ = ["on_disk", "rest", "room_of"]
+def bytes_of(view: TrainingView) -> int:
+    """Of its image and mask."""
+    return view.image.numel() + (0 if view.valid is None else view.valid.numel())
+
+
+__all__ = ["bytes_of", "on_disk", "rest", "room_of"]

@@ -91,10 +91,9 @@ class Schedule:
 
         Raises ValueError for what it never returns.
         """
-        self.pending, self.beside, self.spared, self._turn = (
-            _at_least_zero(state.get(name)) for name in ("pending", "beside", "spared", "turn")
+        self.pending, self.beside, self.spared, self.late, self._turn = (
+            _at_least_zero(state.get(name)) for name in ("pending", "beside", "spared", "late", "turn")
         )
-        self.late = _at_least_zero(state.get("late", 0))  # earlier versions wrote none
         self._local, self._all = _positions(state.get("local"), count), _positions(state.get("all"), trained)
         try:
             self._random.bit_generator.state = state["random"]

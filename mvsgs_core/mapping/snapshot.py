@@ -33,7 +33,7 @@ def snapshot(
     splats.means = (splats.means.to(torch.float64) * length).to(torch.float32)
     splats.log_scales = splats.log_scales + math.log(length)
     count = len(views)
-    exposures = np.array([v.exposure.detach().cpu().numpy() for v in views], dtype=np.float32).reshape(-1, 3, 4)
+    exposures = np.array([v.exposure.cpu().numpy() for v in views], dtype=np.float32).reshape(-1, 3, 4)
     if count and not np.array_equal(exposures, np.broadcast_to(IDENTITY, exposures.shape)):
         if background is not None:
             mean = exposures.mean(axis=0)

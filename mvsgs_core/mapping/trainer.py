@@ -9,13 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvsgs_core.mapping import density_control, optimizer
-from mvsgs_core.mapping.camera_optimizer import step_exposure, step_pose
+from mvsgs_core.mapping import density_control, losses, optimizer
+from mvsgs_core.mapping.camera_optimizer import step_pose
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.exposure import ImageFormation
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.losses import (
-    SPLAT_TERMS,
     LossInputs,
     frequency_of,
     loss_function,
@@ -47,14 +46,11 @@ class Trainer:
     """
 
     def __init__(
-        self, config: MapperConfig, state: MapState, log: Stats, photometry: ImageFormation | None = None,
-        exposure_rate: float = 0.0,
-    ) -> None:  # fmt: skip
-        """photometry: None: no camera is known to have an exposure. exposure_rate: learning rate of the exposures, for
-        views of which nobody measured any; 0: they stay as they are."""
+        self, config: MapperConfig, state: MapState, log: Stats, photometry: ImageFormation | None = None
+    ) -> None:
+        """photometry: None: no camera is known to have an exposure."""
         self.config, self.state, self.log = config, state, log
         self.photometry = ImageFormation() if photometry is None else photometry
-        self.exposure_rate = exposure_rate
         self.iterations = 0
         self.rate = 1.0  # factor on all learning rates: falls during the final refinement
         self.background: np.ndarray | None = None  # (3,) behind the splats, in the map's colors; None: black
@@ -68,11 +64,8 @@ class Trainer:
         """The map as a keyframe's camera photographs it, without gradients. size: height, width; None: the training
         image's."""
         intrinsics = view.intrinsics if size is None else view.intrinsics_at(size)
-        exposure = None if view.measured is None else view.exposure
         with torch.no_grad():
-            render = self._rasterize(
-                self.state.detached(), view, intrinsics, size or view.size, median_depth, exposure, None
-            )
+            render = self._rasterize(self.state.detached(), view, intrinsics, size or view.size, median_depth)
             if self._photographed(view):
                 render.color = render.color.clamp(0.0, 1.0)
             return render
@@ -81,7 +74,7 @@ class Trainer:
         """(N,) the most of a pixel's light that each splat has in a training image."""
         with torch.no_grad():
             found = self._rasterize(
-                self.state.detached(), view, view.intrinsics, view.size, median_depth, None, None, weights=True
+                self.state.detached(), view, view.intrinsics, view.size, median_depth, weights=True, formed=False
             ).weight_max
         assert found is not None
         return found
@@ -90,18 +83,17 @@ class Trainer:
         """One iteration on a keyframe. median_depth: of the scene; refining: no splat is added or removed, and
         they may grow wider, see `OptimizerConfig`."""
         training = self.config.training
-        exposure = None if view.measured is None else view.exposure.requires_grad_(self.exposure_rate > 0.0)
         moving = training.refine_poses and not view.fixed and view.visits >= training.pose_visits
         twist = torch.zeros(6, dtype=torch.float64, requires_grad=True) if moving else None
         groups = self._groups(median_depth, None if refining else self._widest_new(view))
         step = self._fused_step(groups)
         at_once = self._own_loss is None and only_photometric(self._weights)
         render = self._rasterize(
-            self.state.splats, view, view.intrinsics, view.size, median_depth, exposure, twist, step=step,
+            self.state.splats, view, view.intrinsics, view.size, median_depth, twist=twist, step=step,
             formed=not at_once, background=self._unsure_background(),
         )  # fmt: skip
         if at_once:
-            loss = self._photograph_loss(view, render, exposure)
+            loss = self._photograph_loss(view, render)
         else:
             inputs, own = self._loss_inputs(view, render, refining), self._own_loss
             loss = training_loss(inputs, self._weights) if own is None else own_loss(own, inputs)
@@ -150,15 +142,14 @@ class Trainer:
         """What `pruning` judges splats by."""
 
         def render(splats: Splats, view: TrainingView) -> Render:
-            exposure = None if view.measured is None else view.exposure.detach()
-            return self._rasterize(splats, view, view.intrinsics, view.size, median_depth, exposure, None, weights=True)
+            return self._rasterize(splats, view, view.intrinsics, view.size, median_depth, weights=True)
 
         return render
 
     def _rasterize(
         self, splats: Splats, view: TrainingView, intrinsics: np.ndarray, size: tuple[int, int], median_depth: float,
-        exposure: Tensor | None, twist: Tensor | None, *, weights: bool = False, step: SplatStep | None = None,
-        formed: bool = True, background: np.ndarray | None = None,
+        *, twist: Tensor | None = None, weights: bool = False, step: SplatStep | None = None, formed: bool = True,
+        background: np.ndarray | None = None,
     ) -> Render:  # fmt: skip
         """formed: as the camera photographs it, exposure and vignetting done; else the map's own colors. background: in
         the place of the map's."""
@@ -166,7 +157,7 @@ class Trainer:
         render = rasterize(
             splats, view.refined_from_cam, intrinsics, size, kernel=training.kernel, backend=training.backend,
             background=self.background if background is None else background,
-            exposure=exposure if formed else None, pose_delta=twist, readout=view.readout,
+            exposure=_exposure(view) if formed else None, pose_delta=twist, readout=view.readout,
             reads_columns=view.reads_columns, near=training.near * median_depth, antialiased=training.antialiased,
             weights=weights, threads=self.config.threads, step=step,
         )  # fmt: skip
@@ -198,19 +189,20 @@ class Trainer:
             self._factors[key] = factor[..., None].to(self.state.device)
         return self._factors[key]
 
-    def _formation(self, view: TrainingView, exposure: Tensor | None) -> Formation:
+    def _formation(self, view: TrainingView) -> Formation:
         # where it is photographed, white, or black, says that the color is at least, or most, that
         valid = None if view.valid is None else view.valid.to(self.state.device)  # from disk it comes on the CPU
-        return Formation(exposure, self._vignetting(view.intrinsics, view.size), valid, self._photographed(view))
+        vignetting = self._vignetting(view.intrinsics, view.size)
+        return Formation(_exposure(view), vignetting, valid, self._photographed(view))
 
-    def _photograph_loss(self, view: TrainingView, render: Render, exposure: Tensor | None) -> Tensor:
+    def _photograph_loss(self, view: TrainingView, render: Render) -> Tensor:
         return photograph_loss(
-            render.color, view.image, self._formation(view, exposure), l1_weight=self._weights["l1"],
+            render.color, view.image, self._formation(view), l1_weight=self._weights["l1"],
             ssim_weight=self._weights["ssim"], threads=self.config.threads,
         )  # fmt: skip
 
     def _loss_inputs(self, view: TrainingView, render: Render, refining: bool) -> LossInputs:
-        target = self._formation(view, None).target(view.target, render.color)
+        target = self._formation(view).target(view.target, render.color)
         return LossInputs(render, target, self.state.splats, self._frequency(view, refining), self.config.threads)
 
     def _frequency(self, view: TrainingView, refining: bool) -> float:
@@ -235,7 +227,7 @@ class Trainer:
         splats are stepped unseen, or the back end cannot."""
         training, state = self.config.training, self.state
         backend = chosen_backend(training.backend, state.device)
-        leads_on = training.kernel == "ges_scale" or self._own_loss is not None or len(SPLAT_TERMS) > 0
+        leads_on = training.kernel == "ges_scale" or self._own_loss is not None or len(losses.TERMS) > 1
         if backend != "cpu" or leads_on or not training.selective:
             return None
         return optimizer.splat_step(state, groups, self.config.optimizer.decay_steps)
@@ -262,11 +254,14 @@ class Trainer:
             log.skip("splats_unseen", len(self.state) - int(render.visible.sum()))
 
     def _step_camera(self, view: TrainingView, twist: Tensor | None, median_depth: float) -> None:
-        """Adam on the keyframe's exposure and pose, where they are trained."""
+        """Adam on the keyframe's pose, where it is trained."""
         training = self.config.training
-        if view.measured is not None and self.exposure_rate > 0.0:
-            step_exposure(view, self.exposure_rate)
         if twist is not None and twist.grad is not None:
             angle = training.pose_rate * self.rate
             if not step_pose(view, twist.grad.numpy(), angle, angle * median_depth):
                 self.log.refuse("pose_steps", 1, "a step of a keyframe's pose that was not finite was refused")
+
+
+def _exposure(view: TrainingView) -> Tensor | None:
+    """(3, 4) color affine; None: nobody knows any."""
+    return None if view.measured is None else view.exposure

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from abc import abstractmethod
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from mvsgs_core.camera import shrunk
 from mvsgs_core.inverse_depth import enlarge_inverse_depth
-from mvsgs_core.keyframe_window import Correction, KeyframeWindow
+from mvsgs_core.keyframe_window import Correction, WindowedStage
 from mvsgs_core.mvs.backend import make_backend
 from mvsgs_core.mvs.hypotheses import RangeConfig, SearchRange, search_range
 from mvsgs_core.mvs.keyframe import StereoKeyframe, prepare_keyframe
@@ -64,60 +63,36 @@ MASK_MARGIN = 2  # pixels beside a masked one without depth: the matching window
 DOUBTFUL = 0.09  # confidence of the tracker's depth: in fusion, less than any that speaks against another map
 
 
-class OnlineStereo(ABC):
-    """Feeds on keyframes in stream order; `add` and `flush` yield each keyframe's depth exactly once, in order."""
+class OnlineStereo(WindowedStage[StereoKeyframe, CascadeDepth]):
+    """Depth of each keyframe."""
 
     scales: tuple[int, ...] = (1,)  # sizes of the gray images that a keyframe keeps, as divisors of its own
     efforts: tuple[Effort, ...] = (FULL, NO_STEREO)  # best first
 
     def __init__(self, config: OnlineStereoConfig) -> None:
+        super().__init__(config.window, config.lag)
         self.config = config
         self.pace = Pace(self.efforts, config.share, only=config.efforts if config.realtime else (0,))
-        self._window = KeyframeWindow[StereoKeyframe](config.window, config.lag)
         self._previous: tuple[StereoKeyframe, SearchRange] | None = None  # the newest one that got a range
 
     def prepare(self, index: int, image: np.ndarray, **given: Any) -> StereoKeyframe:
         """A keyframe for `add`, at this stereo's sizes; `given`: all else that `prepare_keyframe` takes."""
         return prepare_keyframe(index, image, area=self.config.area, scales=self.scales, **given)
 
-    def add(self, view: StereoKeyframe, wanted: bool = True) -> Iterator[CascadeDepth]:
-        """Depth of the keyframe `lag` before this one; of all that wait if this one starts a new segment or size.
-
-        wanted: whether this one is to get depth too; else it is a neighbor of others only.
-        """
-        for reference, others in self._window.add(view, wanted):
-            yield self._depth_of(reference, others)
-
-    def release(self) -> Iterator[CascadeDepth]:
-        """Depth of the keyframe that has waited longest, though fewer than `lag` came after it."""
-        for reference, others in self._window.release():
-            yield self._depth_of(reference, others)
-
-    def flush(self) -> Iterator[CascadeDepth]:
-        """Depth of the keyframes that still wait, with the neighbors that are there."""
-        for reference, others in self._window.flush():
-            yield self._depth_of(reference, others)
-
     def forget(self) -> None:
-        """The keyframes that come next are of another map. None waits: see `flush`."""
-        self._window = KeyframeWindow[StereoKeyframe](self.config.window, self.config.lag)
+        super().forget()
         self._previous = None
 
-    @property
-    def waiting(self) -> int | None:
-        """Index of the keyframe that has waited longest for later ones."""
-        return self._window.waiting
-
     def move(self, poses: dict[int, Correction]) -> None:
-        """Corrections by keyframe index, for what is still in the window, and the range that is remembered."""
-        self._window.move(poses)
+        """Corrects the range that is remembered, too."""
+        super().move(poses)
         if self._previous is not None and self._previous[0].index in poses:
             before, search = self._previous
             now = before.moved(*poses[before.index])
             factor = now.scale / before.scale
             self._previous = now, replace(search, low=search.low / factor, high=search.high / factor)
 
-    def _depth_of(self, reference: StereoKeyframe, others: list[StereoKeyframe]) -> CascadeDepth:
+    def _result(self, reference: StereoKeyframe, others: list[StereoKeyframe]) -> CascadeDepth:
         previous = None
         if self._previous is not None:
             last, previous = self._previous

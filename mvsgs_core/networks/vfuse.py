@@ -1,8 +1,8 @@
 """V-FUSE (Burgdorfer and Mordohai 2023): fuses depth maps of several views through a visibility constraint volume.
 
-Written from the paper; keys and shapes are those of the official checkpoints. The default confidence `swr` is relative
-to the image (1 for its narrowest search window, 0 for its widest), so a threshold on it keeps a fraction of the pixels
-and is no probability; the others are in vfuse_confidence.
+Written from the paper; keys and shapes are those of the official checkpoints. The confidence is their default, `swr`:
+relative to the image (1 for its narrowest search window, 0 for its widest), so a threshold on it keeps a fraction of
+the pixels and is no probability.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mvsgs_core.networks.posed_views import homogeneous_pixels
-from mvsgs_core.networks.vfuse_confidence import check_mode, confidence_of
 
 PLANES = 8
 
@@ -80,7 +79,7 @@ class FusionInput:
 
 class Fused(NamedTuple):
     depth: Tensor  # (H, W); 0 where no view has a depth
-    confidence: Tensor  # (H, W), 0 to 1, of the mode asked for
+    confidence: Tensor  # (H, W), 0 to 1, see `narrowness`
     bounds: Tensor  # (2, H, W) ends of the search window
     window: Tensor  # (H, W) in 0..1
     statistics: Tensor  # (5, H, W) input of the window network
@@ -108,15 +107,14 @@ class VFuse(nn.Module):
         views: FusionInput,
         center: str = "conf",
         warped: tuple[Tensor, Tensor] | None = None,
-        confidence: str = "swr",
     ) -> Fused:
         """Fuses the views' depths into the reference.
 
         center: "conf", the most confident depth, or "mean", the confidence-weighted mean. `warped`: depths and
-        confidences (V, H, W) already in the reference, else they are splatted here. confidence: see vfuse_confidence.
-        H and W: multiples of 8. Raises ValueError for other sizes, an unknown center or an unknown confidence.
+        confidences (V, H, W) already in the reference, else they are splatted here. H and W: multiples of 8. Raises
+        ValueError for other sizes or an unknown center.
         """
-        check_choices(center, confidence)
+        check_center(center)
         if views.depths.shape[1] % 8 or views.depths.shape[2] % 8:
             raise ValueError(f"V-FUSE needs maps of multiples of 8, got {tuple(views.depths.shape[1:])}")
         depths, confidences = warped if warped is not None else splat_views(views)
@@ -137,10 +135,8 @@ class VFuse(nn.Module):
         logits = self._regularize(volume)
         probability = logits.softmax(dim=0)
         depth = (planes * probability).sum(dim=0)
-        place = (depth - bounds[0]) / ((bounds[1] - bounds[0]) / (PLANES - 1))
-        certainty = confidence_of(confidence, probability, place, radius)
         seen = known.amax(dim=0)
-        return Fused(depth * seen, certainty * seen, bounds, window, statistics, volume, logits, probability)
+        return Fused(depth * seen, narrowness(radius) * seen, bounds, window, statistics, volume, logits, probability)
 
     def _statistics(
         self,
@@ -191,11 +187,15 @@ class VFuse(nn.Module):
         return logits
 
 
-def check_choices(center: str, confidence: str) -> None:
-    """Raises ValueError for what `VFuse` does not know."""
+def check_center(center: str) -> None:
+    """Raises ValueError for one that `VFuse` does not know."""
     if center not in ("conf", "mean"):
         raise ValueError(f"center={center!r}: it is conf or mean")
-    check_mode(confidence)
+
+
+def narrowness(radius: Tensor) -> Tensor:
+    """(H, W) 1 for the narrowest window of the image, 0 for the widest; 1 where all are alike."""
+    return 1 - (radius - radius.min()) / (radius.max() - radius.min()).clamp(min=1e-12)
 
 
 def splat_views(views: FusionInput) -> tuple[Tensor, Tensor]:

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from mvsgs_core import native
-from mvsgs_core.rasterizer.differentiable import Images, Rendered
+from mvsgs_core.rasterizer.differentiable import Images, OnImages, Rendered
 from mvsgs_core.rasterizer.interface import RenderSettings, SplatStep
 from mvsgs_core.rasterizer.splats import FIELDS
 
@@ -36,31 +37,23 @@ def forward(settings: RenderSettings, parameters: list[Tensor]) -> tuple[Images,
         opacity=opacity.numpy(),
         radii=radii.numpy(),
     )
-    weight_sum = weight_max = None
+    weight_max = None
     if settings.weights:
-        weight_sum, weight_max = torch.empty(len(means)), torch.empty(len(means))
-        native.load("rasterizer").weights(passed, weight_sum.numpy(), weight_max.numpy())
-    return (color, depth, opacity), Rendered(radii, passed.refused, weight_sum, weight_max, passed)
+        weight_max = torch.empty(len(means))
+        native.load("rasterizer").weights(passed, weight_max.numpy())
+    return (color, depth, opacity), Rendered(radii, passed.refused, weight_max, passed)
 
 
 def backward(
-    settings: RenderSettings, kept: Any, parameters: list[Tensor], images: Images,
-    on_images: tuple[Tensor, Tensor | None, Tensor | None], on_splats: list[Tensor], on_means2d: Tensor,
-    wants_pose: bool,
+    settings: RenderSettings, kept: Any, parameters: list[Tensor], images: Images, on_images: OnImages,
+    on_splats: list[Tensor], on_means2d: Tensor, wants_pose: bool,
 ) -> tuple[Tensor, int]:  # fmt: skip
     """See `BackEnd`."""
-    color, depth, opacity = (image.numpy() for image in images)
-    on_color, on_depth, on_opacity = (None if gradient is None else gradient.numpy() for gradient in on_images)
     on_pose = torch.zeros(4, 4, dtype=torch.float64)
     refused: int = native.load("rasterizer").backward(
         kept,
         splats=[parameter.numpy() for parameter in parameters],
-        color=color,
-        depth=depth,
-        opacity=opacity,
-        on_color=on_color,
-        on_depth=on_depth,
-        on_opacity=on_opacity,
+        **_arrays(images, on_images),
         on_splats=[gradient.numpy() for gradient in on_splats],
         on_means2d=on_means2d.numpy(),
         on_pose=on_pose.numpy(),
@@ -68,34 +61,23 @@ def backward(
     return on_pose, refused
 
 
-def backward_opacity(
-    kept: Any, opacity_logits: Tensor, images: Images, on_images: tuple[Tensor, Tensor | None, Tensor | None]
-) -> tuple[Tensor, int]:
+def backward_opacity(kept: Any, opacity_logits: Tensor, images: Images, on_images: OnImages) -> tuple[Tensor, int]:
     """See `OpacityBackEnd`."""
-    color, depth, opacity = (image.numpy() for image in images)
-    on_color, on_depth, on_opacity = (None if gradient is None else gradient.numpy() for gradient in on_images)
     on_logits = torch.empty_like(opacity_logits)
     refused: int = native.load("rasterizer").backward_opacity(
         kept,
         opacity_logits=opacity_logits.numpy(),
-        color=color,
-        depth=depth,
-        opacity=opacity,
-        on_color=on_color,
-        on_depth=on_depth,
-        on_opacity=on_opacity,
+        **_arrays(images, on_images),
         on_logits=on_logits.numpy(),
     )
     return on_logits, refused
 
 
 def backward_step(
-    settings: RenderSettings, kept: Any, parameters: list[Tensor], images: Images,
-    on_images: tuple[Tensor, Tensor | None, Tensor | None], step: SplatStep,
+    settings: RenderSettings, kept: Any, parameters: list[Tensor], images: Images, on_images: OnImages,
+    step: SplatStep,
 ) -> tuple[Tensor, int]:  # fmt: skip
     """See `SteppingBackEnd`."""
-    color, depth, opacity = (image.numpy() for image in images)
-    on_color, on_depth, on_opacity = (None if gradient is None else gradient.numpy() for gradient in on_images)
     on_pose = torch.zeros(4, 4, dtype=torch.float64)
     moved = [
         (FIELDS.index(m.name), m.first.numpy(), m.second.numpy(), m.rate, m.final_rate, m.low, m.high, m.lead, m.tail)
@@ -105,12 +87,7 @@ def backward_step(
     refused, step.refused = native.load("rasterizer").backward_step(
         kept,
         values=[parameter.numpy() for parameter in parameters],
-        color=color,
-        depth=depth,
-        opacity=opacity,
-        on_color=on_color,
-        on_depth=on_depth,
-        on_opacity=on_opacity,
+        **_arrays(images, on_images),
         moved=moved,
         ages=step.ages.numpy(),
         constants=step.constants,
@@ -120,3 +97,10 @@ def backward_step(
         on_pose=on_pose.numpy(),
     )
     return on_pose, refused
+
+
+def _arrays(images: Images, on_images: OnImages) -> dict[str, np.ndarray | None]:
+    """As the kernels' arguments."""
+    names, given = ("color", "depth", "opacity"), [*images, *on_images]
+    arrays = (None if tensor is None else tensor.numpy() for tensor in given)
+    return dict(zip([*names, *(f"on_{name}" for name in names)], arrays))

@@ -13,6 +13,7 @@ from mvsgs_core.rasterizer.interface import Backward, Render, RenderSettings, Sp
 from mvsgs_core.rasterizer.splats import Splats
 
 Images = tuple[Tensor, Tensor, Tensor]  # color (H, W, 3), depth (H, W), opacity (H, W)
+OnImages = tuple[Tensor, Tensor | None, Tensor | None]  # gradients of these; None: 0
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,6 @@ class Rendered:
 
     radii: Tensor
     refused: int
-    weight_sum: Tensor | None
     weight_max: Tensor | None
     kept: Any  # what the backward pass reads again, beside parameters and images
 
@@ -33,9 +33,8 @@ class BackEnd(Protocol):
         """Raises ValueError for a dtype or device that the back end does not take."""
 
     def backward(
-        self, settings: RenderSettings, kept: Any, parameters: list[Tensor], images: Images,
-        on_images: tuple[Tensor, Tensor | None, Tensor | None], on_splats: list[Tensor], on_means2d: Tensor,
-        wants_pose: bool,
+        self, settings: RenderSettings, kept: Any, parameters: list[Tensor], images: Images, on_images: OnImages,
+        on_splats: list[Tensor], on_means2d: Tensor, wants_pose: bool,
     ) -> tuple[Tensor | None, int | None]:  # fmt: skip
         """Fills on_splats and on_means2d from the gradients of the images, None: 0; returns that of the pose, and how
         many splats were refused, None: not counted."""
@@ -45,7 +44,7 @@ class OpacityBackEnd(BackEnd, Protocol):
     """One that can give the gradients of opacities without the others."""
 
     def backward_opacity(
-        self, kept: Any, opacity_logits: Tensor, images: Images, on_images: tuple[Tensor, Tensor | None, Tensor | None]
+        self, kept: Any, opacity_logits: Tensor, images: Images, on_images: OnImages
     ) -> tuple[Tensor, int]:
         """As `backward`; the gradient of the logits, and how many splats were refused."""
 
@@ -54,8 +53,8 @@ class SteppingBackEnd(BackEnd, Protocol):
     """One that can step the splats in the backward pass."""
 
     def backward_step(
-        self, settings: RenderSettings, kept: Any, parameters: list[Tensor], images: Images,
-        on_images: tuple[Tensor, Tensor | None, Tensor | None], step: SplatStep,
+        self, settings: RenderSettings, kept: Any, parameters: list[Tensor], images: Images, on_images: OnImages,
+        step: SplatStep,
     ) -> tuple[Tensor, int]:  # fmt: skip
         """As `backward`, but the parameters are changed as `step` says, and no gradient of theirs is kept."""
 
@@ -80,13 +79,11 @@ class _Rasterize(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         *parameters, color, depth, opacity = ctx.saved_tensors
-        on_color, on_depth, on_opacity = (None if g is None else g.detach().contiguous() for g in gradients)
-        on_images = (torch.zeros_like(color) if on_color is None else on_color, on_depth, on_opacity)
         on_splats = [torch.empty_like(parameter) for parameter in parameters]
         on_means2d = color.new_empty(len(parameters[0]), 2)
         on_pose, ctx.report.refused = ctx.back_end.backward(
-            ctx.settings, ctx.kept, parameters, (color, depth, opacity), on_images, on_splats, on_means2d,
-            ctx.needs_input_grad[5],
+            ctx.settings, ctx.kept, parameters, (color, depth, opacity), _on_images(color, gradients), on_splats,
+            on_means2d, ctx.needs_input_grad[5],
         )  # fmt: skip
         *shared, on_betas = on_splats
         return (None, None, None, None, on_means2d, on_pose, *shared, on_betas if ctx.settings.exact else None)
@@ -113,10 +110,8 @@ class _Stepped(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         color, depth, opacity = ctx.saved_tensors
-        on_color, on_depth, on_opacity = (None if g is None else g.detach().contiguous() for g in gradients)
-        on_images = (torch.zeros_like(color) if on_color is None else on_color, on_depth, on_opacity)
         on_pose, ctx.report.refused = ctx.back_end.backward_step(
-            ctx.settings, ctx.kept, ctx.parameters, (color, depth, opacity), on_images, ctx.step
+            ctx.settings, ctx.kept, ctx.parameters, (color, depth, opacity), _on_images(color, gradients), ctx.step
         )
         return (None, None, None, None, None, on_pose, *[None] * len(ctx.parameters))
 
@@ -140,12 +135,16 @@ class _OfOpacities(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         opacity_logits, color, depth, opacity = ctx.saved_tensors
-        on_color, on_depth, on_opacity = (None if g is None else g.detach().contiguous() for g in gradients)
-        on_images = (torch.zeros_like(color) if on_color is None else on_color, on_depth, on_opacity)
         on_logits, ctx.report.refused = ctx.back_end.backward_opacity(
-            ctx.kept, opacity_logits.contiguous(), (color, depth, opacity), on_images
+            ctx.kept, opacity_logits.contiguous(), (color, depth, opacity), _on_images(color, gradients)
         )
         return (None, None, None, None, None, on_logits)
+
+
+def _on_images(color: Tensor, gradients: tuple[Tensor | None, ...]) -> OnImages:
+    """As a back end takes them."""
+    on_color, on_depth, on_opacity = (None if g is None else g.detach().contiguous() for g in gradients)
+    return (torch.zeros_like(color) if on_color is None else on_color), on_depth, on_opacity
 
 
 def render_for_opacities(back_end: OpacityBackEnd, splats: Splats, settings: RenderSettings) -> Render:
@@ -178,6 +177,5 @@ def render_stepping(back_end: SteppingBackEnd, splats: Splats, settings: RenderS
 def _render(images: Images, rest: list[Rendered], report: Backward, means2d: Tensor) -> Render:
     (rendered,) = rest
     return Render(
-        *images, rendered.radii > 0, rendered.radii, means2d, rendered.weight_sum, rendered.weight_max,
-        rendered.refused, report,
+        *images, rendered.radii > 0, rendered.radii, means2d, rendered.weight_max, rendered.refused, report,
     )  # fmt: skip

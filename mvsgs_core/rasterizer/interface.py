@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -33,7 +34,7 @@ class RenderSettings:
     near: float  # map units
     antialiased: bool
     degree: int  # of the spherical harmonics
-    weights: bool  # whether to sum up the blending weights of every splat
+    weights: bool  # whether to find the largest blending weight of every splat
     threads: int  # 0 = as many as OpenMP would take
 
 
@@ -87,7 +88,6 @@ class Render:
     radii: Tensor  # (N,), half of the longer side of the splat's box on the image, px; 0 if not visible
     # empty, or without gradient, where the splats are stepped, or nothing but opacities is trained
     means2d: Tensor  # (N, 2) zeros; after backward .grad is dL/d(mean on the image) in halves of the image, as in 3DGS
-    weight_sum: Tensor | None  # (N,), blending weight alpha * T summed over the pixels; None unless asked for
     weight_max: Tensor | None  # (N,), the largest blending weight at any pixel; None unless asked for
     refused: int  # splats left out because a parameter is not finite or degenerate
     backward: Backward  # what the backward pass reports, once it has run
@@ -98,3 +98,8 @@ def means2d_leaf(splats: Splats, settings: RenderSettings) -> Tensor:
     inputs = [*splats.tensors().values(), settings.pose]
     wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs)
     return splats.means.new_zeros(len(splats), 2).requires_grad_(wanted)
+
+
+def as_bytes(color: Tensor) -> np.ndarray:
+    """uint8 of values from 0 to 1; what is beyond is cut."""
+    return np.asarray((color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy())

@@ -31,13 +31,9 @@ def neutral_beta(kernel: str) -> float:
     return 0.0 if kernel == "ges_scale" else 2.0
 
 
-def scale_factor(b: Tensor) -> Tensor:
-    """2 sigmoid(b / 10) of raw shape parameters (N,): the factor on the scales in "ges_scale"."""
-    return 2.0 * torch.sigmoid(0.1 * b)
-
-
 def log_scale_shift(b: Tensor) -> Tensor:
-    """log of `scale_factor`, finite for every finite b."""
+    """Log of 2 sigmoid(b / 10) of raw shape parameters (N,), the factor on the scales in "ges_scale": finite for every
+    finite b."""
     return math.log(2.0) + torch.nn.functional.logsigmoid(0.1 * b)
 
 

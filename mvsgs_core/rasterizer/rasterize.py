@@ -65,7 +65,6 @@ def rasterize(
     reads_columns: bool = False,
     near: float = 1e-3,
     antialiased: bool = False,
-    degree: int | None = None,
     weights: bool = False,
     threads: int | None = None,
     step: SplatStep | None = None,
@@ -81,8 +80,7 @@ def rasterize(
     first row to the last; world_from_cam is its pose in the middle. None: all rows at once. Carries no gradient.
     reads_columns: from the first column to the last, that is; both coordinates of `Render.means2d` are exchanged then.
     near: splats with z <= near are left out, map units: relate it to the scene's depth.
-    degree: highest degree of the spherical harmonics used; None = all that `splats.sh` has.
-    weights: fill `Render.weight_sum` and `weight_max` (adds about a quarter to the forward pass).
+    weights: fill `Render.weight_max` (adds about a quarter to the forward pass).
     threads: of the "cpu" back end; None = all. The result is the same for every number.
     step: that the backward pass takes, in place of gradients of the splats; of the "cpu" back end and any kernel but
     "ges_scale".
@@ -93,9 +91,6 @@ def rasterize(
     """
     splats.check()
     kernels.check_kernel(kernel)
-    max_degree = spherical_harmonics.degree_of(splats.sh.shape[1])
-    if degree is not None and not 0 <= degree <= max_degree:
-        raise ValueError(f"degree {degree}: the splats have spherical harmonics up to {max_degree}")
     if size[0] < 1 or size[1] < 1:
         raise ValueError(f"an image of {size[0]}x{size[1]} pixels cannot be rendered")
     if kernel == "ges_scale":
@@ -110,7 +105,7 @@ def rasterize(
         background=(0.0, 0.0, 0.0) if background is None else _floats(background, 3, "background"),
         near=float(near),
         antialiased=antialiased,
-        degree=max_degree if degree is None else degree,
+        degree=spherical_harmonics.degree_of(splats.sh.shape[1]),
         weights=weights,
         threads=threads or 0,
     )

@@ -175,7 +175,7 @@ def render(splats: Splats, settings: RenderSettings) -> Render:
     shown = Splats(*(tensor.index_select(0, culled.order) for tensor in splats.tensors().values()))
     p = project(shown, means2d.index_select(0, culled.order), settings)
     background = torch.tensor(settings.background, dtype=dtype, device=device)
-    weight_sum, weight_max, radii = splats.means.new_zeros(3, count).unbind(0)
+    weight_max, radii = splats.means.new_zeros(2, count).unbind(0)
 
     rows_at_once = max(1, PAIRS_AT_ONCE // max(1, width * len(culled.order)))
     columns = torch.arange(width, device=device)
@@ -193,9 +193,8 @@ def render(splats: Splats, settings: RenderSettings) -> Render:
         color.append(weights @ p.colors + transmittance[:, None] * background)
         depth.append(torch.where(covered > 0, weights @ p.depths, 0.0) / torch.where(covered > 0, covered, 1.0))
         opacity.append(1.0 - transmittance)
-        with torch.no_grad():
-            weight_sum[culled.order] += weights.sum(dim=0)
-            if len(culled.order):
+        if len(culled.order):
+            with torch.no_grad():
                 weight_max[culled.order] = torch.maximum(weight_max[culled.order], weights.amax(dim=0))
 
     radii[culled.order] = culled.half_sizes.amax(dim=1)
@@ -206,7 +205,6 @@ def render(splats: Splats, settings: RenderSettings) -> Render:
         visible=radii > 0,
         radii=radii,
         means2d=means2d,
-        weight_sum=weight_sum if settings.weights else None,
         weight_max=weight_max if settings.weights else None,
         refused=culled.refused,
         backward=Backward(),

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
+import numpy as np
 import torch
 from torch import Tensor
+
+Values = TypeVar("Values", Tensor, np.ndarray)
 
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
@@ -43,9 +48,14 @@ def colors(sh: Tensor, directions: Tensor, degree: int) -> Tensor:
     return (0.5 + torch.einsum("nb,nbc->nc", basis(directions, degree), sh[:, :count])).clamp(min=0.0)
 
 
-def from_rgb(rgb: Tensor) -> Tensor:
-    """The coefficient of degree 0 (..., 3) that gives colors (..., 3)."""
+def from_rgb(rgb: Values) -> Values:
+    """The coefficient of degree 0 (..., 3) that gives colors (..., 3), 0 to 1."""
     return (rgb - 0.5) / C0
+
+
+def to_rgb(coefficient: Values) -> Values:
+    """What `from_rgb` undoes."""
+    return 0.5 + C0 * coefficient
 
 
 def degree_of(bases: int) -> int:

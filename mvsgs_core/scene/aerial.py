@@ -7,11 +7,11 @@ import itertools
 import cv2
 import numpy as np
 
-from . import materials
-from .buildings import car, house, tree
-from .lighting import Lighting
-from .noise import blend, fractal, smooth, to_texture, warped
-from .patches import Patch, box, transformed
+from mvsgs_core.scene import materials
+from mvsgs_core.scene.buildings import car, house, tree
+from mvsgs_core.scene.lighting import Lighting
+from mvsgs_core.scene.noise import blend, fractal, smooth, to_texture, warped
+from mvsgs_core.scene.patches import Patch, box, transformed
 
 HALF = 260.0  # half the side of the land
 DENSITY = 4.4  # texels a meter of the ground

@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from . import materials, prints
-from .noise import fractal, to_texture
-from .patches import Material, Patch, blob, box, cylinder, quad, surface
+from mvsgs_core.scene import materials, prints
+from mvsgs_core.scene.noise import fractal, to_texture
+from mvsgs_core.scene.patches import Material, Patch, blob, box, cylinder, quad, surface
 
 ROOFS = (
     ((120, 52, 36), (176, 92, 64)),

@@ -7,8 +7,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from .. import geometry
-from .path import CameraPath
+from mvsgs_core import geometry
+from mvsgs_core.scene.path import CameraPath
 
 
 @dataclass(frozen=True)

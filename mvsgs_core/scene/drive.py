@@ -8,8 +8,8 @@ from collections import Counter
 
 import numpy as np
 
-from .path import Shake, look_at
-from .town import STREETS, Plan
+from mvsgs_core.scene.path import Shake, look_at
+from mvsgs_core.scene.town import STREETS, Plan
 
 Node = tuple[int, int]  # a crossing
 

@@ -6,8 +6,8 @@ import itertools
 
 import numpy as np
 
-from . import materials, prints
-from .patches import Material, Patch, blob, box, box_faces, cylinder, lathe, quad, surface, transformed
+from mvsgs_core.scene import materials, prints
+from mvsgs_core.scene.patches import Material, Patch, blob, box, box_faces, cylinder, lathe, quad, surface, transformed
 
 OAK = ((92, 58, 30), (196, 146, 92))
 WALNUT = ((48, 28, 18), (128, 84, 52))

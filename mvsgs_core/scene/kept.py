@@ -14,10 +14,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from .. import native
-from ..atomic_file import replacing
-from ..cache_folder import cache_folder
-from .lit import LitScene
+from mvsgs_core import native
+from mvsgs_core.atomic_file import replacing
+from mvsgs_core.cache_folder import cache_folder
+from mvsgs_core.scene.lit import LitScene
 
 LIMIT = 8  # scenes; of some 50 MB each
 

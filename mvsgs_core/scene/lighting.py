@@ -9,8 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from . import patches as grids
-from .patches import Patch
+from mvsgs_core.scene import patches as grids
+from mvsgs_core.scene.patches import Patch
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from .. import native
-from . import patches as grids
-from .lighting import Lighting, bake, light_sizes
-from .patches import Patch
+from mvsgs_core import native
+from mvsgs_core.scene import patches as grids
+from mvsgs_core.scene.lighting import Lighting, bake, light_sizes
+from mvsgs_core.scene.patches import Patch
 
 
 @dataclass(frozen=True)

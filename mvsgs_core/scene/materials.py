@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from .noise import blend, fractal, smooth, to_texture, warped
-from .patches import Material, Texture
+from mvsgs_core.scene.noise import blend, fractal, smooth, to_texture, warped
+from mvsgs_core.scene.patches import Material, Texture
 
 RGB = Sequence[float] | np.ndarray  # 0 to 255, sRGB
 

@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from .. import geometry
+from mvsgs_core import geometry
 
 
 class CameraPath(Protocol):

@@ -7,9 +7,9 @@ import colorsys
 import cv2
 import numpy as np
 
-from .materials import cells, shape_of
-from .noise import blend, fractal, smooth, to_texture, warped
-from .patches import Material, Texture
+from mvsgs_core.scene.materials import cells, shape_of
+from mvsgs_core.scene.noise import blend, fractal, smooth, to_texture, warped
+from mvsgs_core.scene.patches import Material, Texture
 
 # Hues of dyes, inks and pigments as a home has them: many warm ones and blues, few greens, hardly a purple.
 HUES = (0.0, 0.02, 0.05, 0.07, 0.09, 0.11, 0.13, 0.16, 0.27, 0.36, 0.5, 0.56, 0.59, 0.62, 0.95)

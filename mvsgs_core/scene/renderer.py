@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .lit import LitScene
+from mvsgs_core.scene.lit import LitScene
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from . import furniture, materials, prints
-from .lighting import Lighting, RectLight
-from .patches import Material, Patch, blob, box, cylinder, lathe, quad, surface, transformed
+from mvsgs_core.scene import furniture, materials, prints
+from mvsgs_core.scene.lighting import Lighting, RectLight
+from mvsgs_core.scene.patches import Material, Patch, blob, box, cylinder, lathe, quad, surface, transformed
 
 WIDTH, LENGTH, HEIGHT = 5.2, 4.4, 2.6  # meters: x, y, z
 WINDOW = ((1.25, 0.95), (3.15, 2.2))  # (y, z) corners on the east wall

@@ -8,16 +8,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from .. import geometry
-from . import aerial, room, town
-from .drive import TownPath
-from .kept import kept
-from .lighting import Lighting
-from .lit import LitScene, lit
-from .materials import marbled
-from .patches import blob
-from .path import CameraPath, FlightPath, RoomPath
-from .renderer import SceneRenderer
+from mvsgs_core import geometry
+from mvsgs_core.scene import aerial, room, town
+from mvsgs_core.scene.drive import TownPath
+from mvsgs_core.scene.kept import kept
+from mvsgs_core.scene.lighting import Lighting
+from mvsgs_core.scene.lit import LitScene, lit
+from mvsgs_core.scene.materials import marbled
+from mvsgs_core.scene.patches import blob
+from mvsgs_core.scene.path import CameraPath, FlightPath, RoomPath
+from mvsgs_core.scene.renderer import SceneRenderer
 
 SCENES = ("room", "aerial", "town")
 

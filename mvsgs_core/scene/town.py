@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from . import materials
-from .lighting import Lighting
-from .noise import fractal, to_texture
-from .patches import Material, Patch, transformed
-from .townhouses import fence, kiosk, lamp, parked_car, rough, street_tree, town_house
+from mvsgs_core.scene import materials
+from mvsgs_core.scene.lighting import Lighting
+from mvsgs_core.scene.noise import fractal, to_texture
+from mvsgs_core.scene.patches import Material, Patch, transformed
+from mvsgs_core.scene.townhouses import fence, kiosk, lamp, parked_car, rough, street_tree, town_house
 
 STREETS = 6  # in either direction; even, so that the outer ones make a ring
 PITCH = (72.0, 60.0)  # meters from one street to the next, west to east and south to north

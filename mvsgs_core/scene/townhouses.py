@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from . import materials, prints
-from .buildings import ROOFS, WALLS
-from .noise import blend, fractal, to_texture
-from .patches import Material, Patch, blob, box, cylinder, quad, surface
+from mvsgs_core.scene import materials, prints
+from mvsgs_core.scene.buildings import ROOFS, WALLS
+from mvsgs_core.scene.noise import blend, fractal, to_texture
+from mvsgs_core.scene.patches import Material, Patch, blob, box, cylinder, quad, surface
 
 DENSITY = 15.0  # texels a meter of a front: a pixel of a 320 wide image, from across the street
 SIDE = 6.0  # of what is seen from aslant or above

@@ -7,7 +7,7 @@ using namespace splats;
 namespace {
 
 // (forward, backward) seconds of the plain-loop rasterizer.
-std::tuple<double, double> run_baseline(nb::handle settings, Array<const double> pose, const SplatArrays& splats,
+std::tuple<double, double> run_baseline(nb::handle settings, Array<double> pose, const SplatArrays& splats,
                                         Out color, In color_gradient, Out image_gradient) {
     const Camera camera = camera_of(settings, pose);
     Frame frame;
@@ -22,8 +22,7 @@ std::tuple<double, double> run_baseline(nb::handle settings, Array<const double>
 
 }  // namespace
 
-#define BENCH_MODULE(name) NB_MODULE(name, m)
-BENCH_MODULE(MVSGS_MODULE) {
+NB_MODULE(MVSGS_MODULE, m) {
     m.def("baseline", &run_baseline);
     m.def("peak_kernel_values", &peak_kernel_values);
     m.def("peak_products", &peak_products);

@@ -57,15 +57,13 @@ void parallax(const DepthMaps& maps, int threads, float* moved) {
     }
 }
 
-void consistent_views(const DepthMaps& maps, const Warp* back, const float* relative, const ConsistencyOptions& o,
-                      std::uint8_t* count) {
+void consistent_views(const DepthMaps& maps, const float* relative, int threads, std::uint8_t* count) {
     const int height = maps.height, width = maps.width, views = maps.views;
     const int nh = maps.neighbor_height, nw = maps.neighbor_width;
     const float *depth = maps.depth, *neighbor_depths = maps.neighbors;
     const Warp* warps = maps.warps;
     const std::size_t stride = static_cast<std::size_t>(nh) * nw;
-    const float limit = o.pixels * o.pixels;
-#pragma omp parallel for schedule(static) num_threads(o.threads)
+#pragma omp parallel for schedule(static) num_threads(threads)
     for (int y = 0; y < height; ++y) {
         for (int x = 0; x < width; ++x) {
             const std::size_t i = static_cast<std::size_t>(y) * width + x;
@@ -78,14 +76,7 @@ void consistent_views(const DepthMaps& maps, const Warp* back, const float* rela
                     if (at < 0) continue;
                     const float found = neighbor_depths[n * stride + at];
                     if (!(found > 0.0f)) continue;
-                    if (!o.round_trip) {
-                        agreeing += std::fabs(found - p.depth) < relative[i] * std::max(found, p.depth);
-                        continue;
-                    }
-                    const Projected q = project(back[n], static_cast<float>(at % nw), static_cast<float>(at / nw), found);
-                    const float dx = q.x - u, dy = q.y - v;
-                    agreeing += q.front && dx * dx + dy * dy < limit &&
-                                std::fabs(q.depth - z) < relative[i] * std::max(q.depth, z);
+                    agreeing += std::fabs(found - p.depth) < relative[i] * std::max(found, p.depth);
                 }
             }
             count[i] = static_cast<std::uint8_t>(agreeing);

@@ -18,20 +18,13 @@ struct DepthMaps {
     int views, neighbor_height, neighbor_width;
 };
 
-struct ConsistencyOptions {
-    float pixels;     // round trip: largest distance to where it started
-    bool round_trip;
-    int threads;
-};
-
 // moved (H, W): pixels that the neighbors together, by the root of the sum of squares, move a point for a relative
 // change of its inverse depth; only those in whose image it falls count; 0 where depth is unknown.
 void parallax(const DepthMaps& maps, int threads, float* moved);
 
 // views (H, W): the number of neighbors whose depth agrees with the reference's, within `relative` (H, W) of the larger.
-// One way: the reference's point, projected, against the depth found there. Round trip: that depth, projected back.
-void consistent_views(const DepthMaps& maps, const Warp* back, const float* relative,
-                      const ConsistencyOptions& options, std::uint8_t* count);
+// The reference's point, projected, against the depth found there.
+void consistent_views(const DepthMaps& maps, const float* relative, int threads, std::uint8_t* count);
 
 // splatted (H, W): depth in the reference of a neighbor's pixels, the nearest one where several fall; 0 where none.
 void splat_depth(const float* neighbor_depth, const float* neighbor_confidence, int neighbor_height,

@@ -1,6 +1,6 @@
 // Python bindings of the fusion kernels. Shapes are checked here, once; the interpreter's lock is released inside.
 #include "fusion/fusion.hpp"
-#include "mvs/bindings.hpp"
+#include "mvs/arguments.hpp"
 
 namespace {
 
@@ -20,15 +20,12 @@ Result<float> parallax(Image depth, Stack neighbor_depths, Warps warps, int thre
     return moved;
 }
 
-Result<std::uint8_t> consistent_views(Image depth, Stack neighbor_depths, Warps warps, Warps back, Image relative,
-                                      const fusion::ConsistencyOptions& options) {
-    one_warp_each(neighbor_depths, back);
+Result<std::uint8_t> consistent_views(Image depth, Stack neighbor_depths, Warps warps, Image relative, int threads) {
     same_size(depth, relative);
     const fusion::DepthMaps maps = maps_of(depth, neighbor_depths, warps);
     auto count = allocate<std::uint8_t>({depth.shape(0), depth.shape(1)});
-    const fusion::ConsistencyOptions o = with_threads(options);
     nb::gil_scoped_release release;
-    fusion::consistent_views(maps, data_of(back), relative.data(), o, count.data());
+    fusion::consistent_views(maps, relative.data(), thread_count(threads), count.data());
     return count;
 }
 
@@ -74,15 +71,12 @@ nb::tuple fuse_depth(Image depth, Image confidence, Stack neighbor_depths, Stack
 
 }  // namespace
 
-MVSGS_EXPAND(MVSGS_MODULE, m) {
+NB_MODULE(MVSGS_MODULE, m) {
     using namespace nb::literals;
-    nb::class_<fusion::ConsistencyOptions>(m, "ConsistencyOptions")
-        .def(nb::init<float, bool, int>(), "pixels"_a, "round_trip"_a, "threads"_a);
     nb::class_<fusion::FuseOptions>(m, "FuseOptions")
         .def(nb::init<float, float, int>(), "violation"_a, "min_neighbor_confidence"_a, "threads"_a);
     m.def("parallax", &parallax, "depth"_a, "neighbor_depths"_a, "warps"_a, "threads"_a);
-    m.def("consistent_views", &consistent_views, "depth"_a, "neighbor_depths"_a, "warps"_a, "back"_a, "relative"_a,
-          "options"_a);
+    m.def("consistent_views", &consistent_views, "depth"_a, "neighbor_depths"_a, "warps"_a, "relative"_a, "threads"_a);
     m.def("splat_depths", &splat_depths, "neighbor_depths"_a, "neighbor_confidences"_a, "back"_a, "height"_a,
           "width"_a, "options"_a);
     m.def("fuse_depth", &fuse_depth, "depth"_a, "confidence"_a, "neighbor_depths"_a, "neighbor_confidences"_a,

@@ -1,23 +1,20 @@
 // Adam on gradients that lie in memory: of any back end but the C++ one, which steps as it makes them.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
-#include <omp.h>
 
-#include <stdexcept>
 #include <tuple>
 
-#include "in_place.hpp"
+#include "bindings.hpp"
 #include "rasterizer/adam.hpp"
 
-namespace nb = nanobind;
-using Gradient = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-using Rows = InPlace<float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-using Flags = nb::ndarray<const bool, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-using Counts = InPlace<int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using namespace bindings;
 
 namespace {
+
+using Gradient = Array<float, nb::ndim<2>>;
+using Rows = Written<float, nb::ndim<2>>;
+using Flags = Array<bool, nb::ndim<1>>;
+using Counts = Written<int32_t, nb::ndim<1>>;
 
 // value, gradient, first and second moment (N, width) of a parameter; rate, final_rate, low, high, lead and tail of Group
 using Parameter = std::tuple<Rows, Gradient, Rows, Rows, float, float, float, float, int, float>;
@@ -25,17 +22,16 @@ using Parameter = std::tuple<Rows, Gradient, Rows, Rows, float, float, float, fl
 int64_t step_all(const std::vector<Parameter>& parameters, Flags visible, Counts steps, float beta1, float beta2,
              float epsilon, int decay_steps, int threads) {
     const int64_t n = static_cast<int64_t>(visible.shape(0));
-    if (static_cast<int64_t>(steps.shape(0)) != n)
-        throw std::invalid_argument("adam: steps and visible differ in length");
+    require(static_cast<int64_t>(steps.shape(0)) == n, "adam: steps and visible differ in length");
     std::vector<adam::Group> groups;
     for (const auto& [value, gradient, first, second, rate, final_rate, low, high, lead, tail] : parameters) {
         const auto width = value.shape(1);
         const auto differs = [&](const auto& rows) {
             return static_cast<int64_t>(rows.shape(0)) != n || rows.shape(1) != width;
         };
-        if (differs(value) || differs(gradient) || differs(first) || differs(second))
-            throw std::invalid_argument("adam: the arrays of a group differ in shape");
-        if (width > adam::kMaxWidth) throw std::invalid_argument("adam: more than 48 values a splat");
+        require(!differs(value) && !differs(gradient) && !differs(first) && !differs(second),
+                "adam: the arrays of a group differ in shape");
+        require(width <= adam::kMaxWidth, "adam: more than 48 values a splat");
         groups.push_back({value.data(), gradient.data(), first.data(), second.data(), static_cast<int>(width), rate,
                           final_rate, low, high, lead, tail, {}});
     }

@@ -1,19 +1,16 @@
 // Python bindings of the mapper's kernels. Shapes are checked here, once; the interpreter's lock is released inside.
-#include <algorithm>
-
+#include "bindings.hpp"
 #include "mapping/partition.hpp"
-#include "mvs/bindings.hpp"
 
-namespace nb = nanobind;
-
-void bind_adam(nb::module_& m);
+void bind_adam(nanobind::module_& m);
 
 namespace {
 
 using namespace bindings;
-using Colors = nb::ndarray<const float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
-using Mask = nb::ndarray<const bool, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-using Precise = nb::ndarray<const double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Image = Array<float, nb::ndim<2>>;
+using Colors = Array<float, nb::shape<-1, -1, 3>>;
+using Mask = Array<bool, nb::ndim<2>>;
+using Precise = Array<double, nb::ndim<2>>;
 
 nb::tuple split(Colors colors, Image weight, Image left, Mask taken, Mask sure, Precise logarithm, double angle,
                 float price, int threads) {
@@ -29,15 +26,13 @@ nb::tuple split(Colors colors, Image weight, Image left, Mask taken, Mask sure, 
         nb::gil_scoped_release release;
         sides = partition::split(image, angle, price, thread_count(threads), labels.data());
     }
-    auto found = allocate<std::int64_t>({sides.size() / 2, std::size_t{2}});
-    std::copy(sides.begin(), sides.end(), found.data());
-    return nb::make_tuple(labels, found);
+    const std::size_t count = sides.size() / 2;
+    return nb::make_tuple(labels, to_numpy(std::move(sides), {count, 2}));
 }
 
 }  // namespace
 
-#define MVSGS_DEFINE(name) NB_MODULE(name, m)
-MVSGS_DEFINE(MVSGS_MODULE) {
+NB_MODULE(MVSGS_MODULE, m) {
     m.doc() = "Kernels of the online mapper.";
     bind_adam(m);
     m.def("partition", &split, nb::arg("colors"), nb::arg("weight"), nb::arg("left"), nb::arg("taken"), nb::arg("sure"),

@@ -5,13 +5,13 @@
 #include <optional>
 #include <string>
 
-#include "mvs/bindings.hpp"
+#include "mvs/arguments.hpp"
 #include "mvs/mvs.hpp"
 
 namespace {
 
 using namespace bindings;
-using Tiles = nb::ndarray<const std::uint8_t, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+using Tiles = Array<std::uint8_t, nb::ndim<3>>;
 
 mvs::Images images_of(const Image& reference, const Stack& neighbors, const Warps& warps) {
     require(neighbors.shape(0) == warps.shape(0) && neighbors.shape(0) > 0, "one warp per neighbor, at least one");
@@ -109,7 +109,7 @@ nb::tuple choose_surface(Stack cost, Stack surfaces, Image reference, const mvs:
 
 }  // namespace
 
-MVSGS_EXPAND(MVSGS_MODULE, m) {
+NB_MODULE(MVSGS_MODULE, m) {
     using namespace nb::literals;
     m.attr("TILE") = nb::make_tuple(mvs::kTileRows, mvs::kTileColumns);
     nb::class_<mvs::CostOptions>(m, "CostOptions")

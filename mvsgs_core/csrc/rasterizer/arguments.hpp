@@ -1,25 +1,18 @@
 // What Python hands over, as the kernels take it. What is written into is never a copy.
 #pragma once
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
-#include <omp.h>
 
-#include "in_place.hpp"
+#include "bindings.hpp"
 #include "rasterizer/frame.hpp"
 
 namespace splats {
 
-namespace nb = nanobind;
+using namespace bindings;
 
-template <class T, class... Shape>
-using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu, Shape...>;
-using In = Array<const float>;
-template <class T>
-using Written = InPlace<T, nb::c_contig, nb::device::cpu>;
+using In = Array<float>;
 using Out = Written<float>;
 
 // The fields of splats.py's Splats, in their order.
@@ -40,10 +33,8 @@ T setting(nb::handle settings, const char* name) {
     return nb::cast<T>(settings.attr(name));
 }
 
-inline int thread_count(int threads) { return std::max(1, threads > 0 ? threads : omp_get_max_threads()); }
-
 // pose: world_from_cam by rows, apart from the settings because it may carry a gradient.
-inline Camera camera_of(nb::handle settings, Array<const double> pose) {
+inline Camera camera_of(nb::handle settings, Array<double> pose) {
     Camera camera;
     const auto [height, width] = setting<std::tuple<int, int>>(settings, "size");
     for (int i = 0; i < 3; ++i) {

@@ -16,7 +16,7 @@ struct Workspace {
     std::vector<Placed> placed;         // of every pair; behind them one that is seen nowhere
     std::vector<uint16_t> blocks;       // of every pair: blocks that the ellipse touches and that aren't full before it
     std::vector<uint32_t> list;         // pairs that touch the block at hand
-    std::vector<Lanes> weight_sum, weight_max;
+    std::vector<Lanes> weight_max;
     int64_t evaluated = 0, contributed = 0;
 
     void take(const Frame& frame, const Tile& tile, bool weights) {
@@ -36,7 +36,6 @@ struct Workspace {
         placed[count] = Placed{};
         placed[count].log2_opacity = 2.0f * kLog2MinAlpha;
         if (!weights) return;
-        weight_sum.assign(count + 1, Lanes{});
         weight_max.assign(count + 1, Lanes{});
     }
 
@@ -76,7 +75,6 @@ PixelSums blend_block(const Tile& tile, int block, Workspace& work) {
             sums.blue += s.blue * weight;
             sums.depth += s.depth * weight;
             if constexpr (Weights) {
-                work.weight_sum[list[i]] += weight;
                 work.weight_max[list[i]] = maximum(work.weight_max[list[i]], weight);
                 work.contributed += count(at_least(weight, kTiny));
             }
@@ -111,10 +109,7 @@ template <bool Exact, bool Weights>
     for (uint32_t i = 0; i < tile.end - tile.begin; ++i) {
         Pair& pair = frame.pairs[tile.begin + i];
         pair.blocks = work.blocks[i];
-        if constexpr (Weights) {
-            frame.weight_slots[2 * size_t(pair.slot)] = sum(work.weight_sum[i]);
-            frame.weight_slots[2 * size_t(pair.slot) + 1] = largest(work.weight_max[i]);
-        }
+        if constexpr (Weights) frame.weight_slots[pair.slot] = largest(work.weight_max[i]);
     }
 }
 
@@ -140,7 +135,7 @@ void blend_all(Frame& frame, const Images<float>& images, int threads) {
 }  // namespace
 
 void blend(Frame& frame, bool weights, float* color, float* depth, float* opacity, int threads) {
-    if (weights) frame.weight_slots.resize(2 * size_t(frame.pair_count));
+    if (weights) frame.weight_slots.resize(size_t(frame.pair_count));
     auto* chosen = frame.exact ? (weights ? blend_all<true, true> : blend_all<true, false>)
                                : (weights ? blend_all<false, true> : blend_all<false, false>);
     chosen(frame, {color, depth, opacity}, threads);

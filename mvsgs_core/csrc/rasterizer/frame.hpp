@@ -151,7 +151,7 @@ struct Frame {
     Buffer<Pair> pairs;              // by tile, front to back
     Buffer<uint32_t> tile_begin;     // (tiles + 1)
     Buffer<Lanes> slots;             // by splat: sums of one pair each
-    Buffer<float> weight_slots;      // by splat: (sum, max) of the blending weights of one pair
+    Buffer<float> weight_slots;      // by splat: the largest blending weight of one pair
 };
 
 struct Gradients {

@@ -45,7 +45,7 @@ struct Pass {
     ~Pass() { pool().give(std::move(frame)); }
 };
 
-std::unique_ptr<Pass> forward(nb::handle settings, Array<const double> pose, const SplatArrays& splats, Out color,
+std::unique_ptr<Pass> forward(nb::handle settings, Array<double> pose, const SplatArrays& splats, Out color,
                               Out depth, Out opacity, Out radii, uint32_t max_pairs) {
     auto pass = std::make_unique<Pass>();
     Frame& frame = *pass->frame;
@@ -132,18 +132,14 @@ std::tuple<int64_t, int64_t> backward_step(Pass& pass, const std::array<Out, 6>&
     return {stepped.refused, stepped.refused_steps};
 }
 
-// (sum, max) of the blending weights of every splat; the pass must have been made with weights.
-void weights(const Pass& pass, Out weight_sum, Out weight_max) {
+// The largest blending weight of every splat; the pass must have been made with weights.
+void weights(const Pass& pass, Out weight_max) {
     const Frame& frame = *pass.frame;
-    const size_t count = weight_sum.shape(0);
+    const size_t count = weight_max.shape(0);
     for (size_t i = 0; i < count; ++i) {
         const SlotSpan span = frame.spans[i];
-        float sum = 0.0f, max = 0.0f;
-        for (uint32_t k = span.first; k < span.first + span.count; ++k) {
-            sum += frame.weight_slots[2 * size_t(k)];
-            max = std::max(max, frame.weight_slots[2 * size_t(k) + 1]);
-        }
-        weight_sum.data()[i] = sum;
+        float max = 0.0f;
+        for (uint32_t k = span.first; k < span.first + span.count; ++k) max = std::max(max, frame.weight_slots[k]);
         weight_max.data()[i] = max;
     }
 }
@@ -159,8 +155,8 @@ std::tuple<double, double> image_loss(In image, In target, std::optional<In> pix
 }
 
 // (L1, SSIM) of a photograph, see photometric.hpp; `gradient` gets that by the color. What may be None is not there.
-std::tuple<double, double> photograph(In color, Array<const uint8_t> image, std::optional<In> exposure,
-                                      std::optional<In> factor, std::optional<Array<const bool>> valid, bool clipped,
+std::tuple<double, double> photograph(In color, Array<uint8_t> image, std::optional<In> exposure,
+                                      std::optional<In> factor, std::optional<Array<bool>> valid, bool clipped,
                                       float l1_weight, float ssim_weight, Out gradient, int threads) {
     const nb::gil_scoped_release released;
     const uint8_t* mask = valid ? reinterpret_cast<const uint8_t*>(valid->data()) : nullptr;
@@ -173,8 +169,7 @@ std::tuple<double, double> photograph(In color, Array<const uint8_t> image, std:
 
 }  // namespace
 
-#define SPLATS_MODULE(name) NB_MODULE(name, m)
-SPLATS_MODULE(MVSGS_MODULE) {
+NB_MODULE(MVSGS_MODULE, m) {
     nb::set_leak_warnings(false);  // a render may well outlive the interpreter's other modules
     nb::class_<Pass>(m, "Pass")
         .def_prop_ro("refused", [](const Pass& pass) { return pass.frame->refused; })

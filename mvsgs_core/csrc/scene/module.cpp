@@ -1,44 +1,28 @@
 // Python binding of the scene renderer: see mvsgs_core/scene/renderer.py for what the arrays mean.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/unique_ptr.h>
 #include <nanobind/stl/vector.h>
-#include <omp.h>
 
-#include <stdexcept>
-
+#include "bindings.hpp"
 #include "scene.hpp"
 
-namespace nb = nanobind;
+using namespace bindings;
 using nb::literals::operator""_a;
 
 namespace {
 
 using scene::Scene;
-using Floats = nb::ndarray<const float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-using Points = nb::ndarray<const float, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
-using Corners = nb::ndarray<const float, nb::shape<-1, 3, 3>, nb::c_contig, nb::device::cpu>;
-using Coordinates = nb::ndarray<const float, nb::shape<-1, 3, 2>, nb::c_contig, nb::device::cpu>;
-using Indices = nb::ndarray<const int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-using Texture = nb::ndarray<const uint8_t, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
-using Sizes = nb::ndarray<const int32_t, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
-using Matrix = nb::ndarray<const double, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>;
-using Rects = nb::ndarray<const float, nb::shape<-1, 4, 3>, nb::c_contig, nb::device::cpu>;
-
-int thread_count(int threads) { return threads > 0 ? threads : omp_get_max_threads(); }
+using Floats = Array<float, nb::ndim<1>>;
+using Points = Array<float, nb::shape<-1, 3>>;
+using Corners = Array<float, nb::shape<-1, 3, 3>>;
+using Coordinates = Array<float, nb::shape<-1, 3, 2>>;
+using Indices = Array<int32_t, nb::ndim<1>>;
+using Texture = Array<uint8_t, nb::shape<-1, -1, 3>>;
+using Sizes = Array<int32_t, nb::shape<-1, 2>>;
+using Matrix = Array<double, nb::shape<4, 4>>;
+using Rects = Array<float, nb::shape<-1, 4, 3>>;
 
 scene::Vec3 vector_at(const float* p) { return {p[0], p[1], p[2]}; }
 scene::Color color_at(const float* p) { return scene::Color{p[0], p[1], p[2], 0}; }
-
-using Shape = std::vector<size_t>;
-
-nb::ndarray<nb::numpy, float> array(const Shape& shape, float*& data) {
-    size_t n = 1;
-    for (const size_t s : shape) n *= s;
-    data = new float[n];
-    nb::capsule owner(data, [](void* p) noexcept { delete[] static_cast<float*>(p); });
-    return nb::ndarray<nb::numpy, float>(data, shape.size(), shape.data(), owner);
-}
 
 scene::Pose pose_of(const Matrix& m) {
     scene::Pose pose;
@@ -95,40 +79,39 @@ nb::tuple render(const Scene& self, const Matrix& world_from_cam, double fx, dou
     const scene::Camera camera{pose_of(world_from_cam), static_cast<float>(fx), static_cast<float>(fy),
                                static_cast<float>(cx), static_cast<float>(cy), height, width};
     const scene::Pose mover_pose = pose_of(mover_from_world);
-    float *color = nullptr, *depth = nullptr;
     const size_t h = static_cast<size_t>(height), w = static_cast<size_t>(width);
-    auto color_array = array(wants_color ? Shape{h, w, 3} : Shape{0, 0, 3}, color);
-    auto depth_array = array(wants_depth ? Shape{h, w} : Shape{0, 0}, depth);
+    auto color = wants_color ? allocate<float>({h, w, 3}) : allocate<float>({0, 0, 3});
+    auto depth = wants_depth ? allocate<float>({h, w}) : allocate<float>({0, 0});
     {
         nb::gil_scoped_release release;
         self.render(camera, gloss, vector_at(gloss_light.data()), mover, mover_pose, thread_count(threads),
-                    wants_color ? color : nullptr, wants_depth ? depth : nullptr);
+                    wants_color ? color.data() : nullptr, wants_depth ? depth.data() : nullptr);
     }
-    return nb::make_tuple(color_array, depth_array);
+    return nb::make_tuple(color, depth);
 }
 
-nb::ndarray<nb::numpy, float> direct_light(const Scene& self, const Points& points, const Points& normals,
-                                           const Rects& lights, int rays, uint64_t seed, int threads) {
+Result<float> direct_light(const Scene& self, const Points& points, const Points& normals, const Rects& lights,
+                           int rays, uint64_t seed, int threads) {
     if (normals.shape(0) != points.shape(0)) throw std::invalid_argument("one point, one normal");
     std::vector<scene::RectLight> rects;
     for (size_t i = 0; i < lights.shape(0); ++i) {
         const float* p = lights.data() + 12 * i;
         rects.push_back({vector_at(p), vector_at(p + 3), vector_at(p + 6), color_at(p + 9)});
     }
-    float* out = nullptr;
-    auto result = array({points.shape(0), 3}, out);
+    auto result = allocate<float>({points.shape(0), 3});
     nb::gil_scoped_release release;
-    self.direct_light(points.data(), normals.data(), points.shape(0), rects, rays, seed, thread_count(threads), out);
+    self.direct_light(points.data(), normals.data(), points.shape(0), rects, rays, seed, thread_count(threads),
+                      result.data());
     return result;
 }
 
-nb::ndarray<nb::numpy, float> bounced_light(const Scene& self, const Points& points, const Points& normals, int rays,
-                                            uint64_t seed, int threads) {
+Result<float> bounced_light(const Scene& self, const Points& points, const Points& normals, int rays, uint64_t seed,
+                            int threads) {
     if (normals.shape(0) != points.shape(0)) throw std::invalid_argument("one point, one normal");
-    float* out = nullptr;
-    auto result = array({points.shape(0), 3}, out);
+    auto result = allocate<float>({points.shape(0), 3});
     nb::gil_scoped_release release;
-    self.bounced_light(points.data(), normals.data(), points.shape(0), rays, seed, thread_count(threads), out);
+    self.bounced_light(points.data(), normals.data(), points.shape(0), rays, seed, thread_count(threads),
+                       result.data());
     return result;
 }
 
@@ -137,11 +120,9 @@ void set_light(Scene& self, const Points& light) {
     for (size_t i = 0; i < light.shape(0); ++i) self.surfaces.light()[i] = color_at(light.data() + 3 * i);
 }
 
-#define BIND(name, m) NB_MODULE(name, m)
-
 }  // namespace
 
-BIND(MVSGS_MODULE, m) {
+NB_MODULE(MVSGS_MODULE, m) {
     nb::class_<Scene>(m, "Scene")
         .def(nb::new_(&make), "corners"_a, "coordinates"_a, "patch_of"_a, "textures"_a, "light_sizes"_a, "gloss"_a, "sky"_a)
         .def("render", &render, "world_from_cam"_a, "fx"_a, "fy"_a, "cx"_a, "cy"_a, "height"_a, "width"_a, "gloss"_a,

@@ -1,6 +1,4 @@
 // Python bindings of the tracking kernels. Lists of points are checked here, all other shapes by the Python callers.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
@@ -9,42 +7,27 @@
 #include <cmath>
 #include <cstdint>
 #include <optional>
-#include <stdexcept>
 
+#include "bindings.hpp"
 #include "bundle_adjustment.hpp"
 #include "cholesky.hpp"
 #include "lucas_kanade.hpp"
 #include "nearest.hpp"
 #include "optimize.hpp"
 
-namespace nb = nanobind;
+using namespace bindings;
 using namespace mvsgs;
 
 template <class T>
-using In = nb::ndarray<const T, nb::c_contig, nb::device::cpu>;
-template <class T>
-using Out = nb::ndarray<nb::numpy, T>;
-
-static void require(bool condition, const char* what) {
-    if (!condition) throw std::invalid_argument(what);
-}
-
-template <class T>
-static bool is_pairs(const In<T>& array) {
+static bool is_pairs(const Array<T>& array) {
     return array.ndim() == 2 && array.shape(1) == 2;
 }
 
-template <class T>
-static Out<T> to_numpy(std::vector<T>&& values, std::initializer_list<size_t> shape) {
-    auto* owned = new std::vector<T>(std::move(values));
-    nb::capsule owner(owned, [](void* p) noexcept { delete static_cast<std::vector<T>*>(p); });
-    return Out<T>(owned->data(), shape, owner);
-}
-
-static nb::dict bundle_adjust(In<double> poses, In<double> inverse_depth, In<double> pixels, In<double> intrinsics,
-                              In<int32_t> from, In<int32_t> to, In<double> target, In<double> information,
-                              In<uint8_t> free_pose, In<uint8_t> free_depth, In<double> damping,
-                              std::optional<In<double>> prior, std::optional<In<double>> prior_weight,
+static nb::dict bundle_adjust(Array<double> poses, Array<double> inverse_depth, Array<double> pixels,
+                              Array<double> intrinsics, Array<int32_t> from, Array<int32_t> to, Array<double> target,
+                              Array<double> information, Array<uint8_t> free_pose, Array<uint8_t> free_depth,
+                              Array<double> damping, std::optional<Array<double>> prior,
+                              std::optional<Array<double>> prior_weight,
                               bool free_focal, int robust, double robust_scale, double min_z,
                               double min_inverse_depth, int steps, bool adaptive, double lm, double ep,
                               double tolerance, int threads) {
@@ -107,7 +90,7 @@ static nb::dict bundle_adjust(In<double> poses, In<double> inverse_depth, In<dou
     return result;
 }
 
-static Pyramid pyramid(const std::vector<In<float>>& levels, int border) {
+static Pyramid pyramid(const std::vector<Array<float>>& levels, int border) {
     Pyramid p{{}, border};
     for (const auto& level : levels) {
         const int h = static_cast<int>(level.shape(0)), w = static_cast<int>(level.shape(1));
@@ -117,9 +100,9 @@ static Pyramid pyramid(const std::vector<In<float>>& levels, int border) {
 }
 
 // (N, 4) float32: u, v, forward-backward distance (infinite where lost), correlation.
-static Out<float> lucas_kanade(const std::vector<In<float>>& a, const std::vector<In<float>>& b, In<float> points,
-                               In<float> guess, int border, int start_level, int iterations, float window_sigma,
-                               float min_eigenvalue, int threads) {
+static Result<float> lucas_kanade(const std::vector<Array<float>>& a, const std::vector<Array<float>>& b,
+                                  Array<float> points, Array<float> guess, int border, int start_level, int iterations,
+                                  float window_sigma, float min_eigenvalue, int threads) {
     require(is_pairs(points) && is_pairs(guess) && guess.shape(0) == points.shape(0),
             "lucas_kanade: points and guess must be (N, 2), of one length");
     const Pyramid pa = pyramid(a, border), pb = pyramid(b, border);
@@ -148,8 +131,8 @@ static Out<float> lucas_kanade(const std::vector<In<float>>& a, const std::vecto
     return to_numpy(std::move(out), {static_cast<size_t>(n), 4});
 }
 
-static Out<double> median_of_nearest(In<double> points, In<double> values, In<double> queries, int count,
-                                     double radius) {
+static Result<double> median_of_nearest(Array<double> points, Array<double> values, Array<double> queries, int count,
+                                        double radius) {
     require(is_pairs(points) && is_pairs(queries) && values.ndim() == 1 && values.shape(0) == points.shape(0),
             "median_of_nearest: points must be (N, 2), values (N,) and queries (M, 2)");
     const int n = static_cast<int>(points.shape(0)), m = static_cast<int>(queries.shape(0));
@@ -162,7 +145,7 @@ static Out<double> median_of_nearest(In<double> points, In<double> values, In<do
 }
 
 // Solution (N) of A x = b and the smallest relative pivot: a serial solve, which a busy machine does not slow down.
-static nb::tuple solve_positive_definite(In<double> a, In<double> b) {
+static nb::tuple solve_positive_definite(Array<double> a, Array<double> b) {
     std::vector<double> matrix(a.data(), a.data() + a.size()), x(b.data(), b.data() + b.size());
     double pivot;
     {

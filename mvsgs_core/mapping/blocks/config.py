@@ -7,7 +7,7 @@ from typing import Literal
 
 from mvsgs_core.named_modules import is_installed
 
-MISSING = "refine=ray needs Ray: pip install 'mvsgs[ray]', here and on the cluster's machines"
+MISSING = "refine=ray needs Ray: pip install 'ray>=2.40', here and on the cluster's machines"
 
 
 @dataclass(frozen=True)

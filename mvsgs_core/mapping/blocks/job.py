@@ -42,8 +42,7 @@ GRAY_LEVEL = 1.0 / 255.0  # of a pixel's light: what has less everywhere is not 
 NO_IMAGE = np.zeros((0, 0, 3), np.uint8)
 NOBODY = -(2**63)  # anchor of a splat that another block owns
 LEARNED = (  # what a keyframe's home says of it
-    "exposure", "exposure_moments", "pose_delta", "pose_moments", "pose_steps", "visits", "visits_here", "loss_fast",
-    "loss_slow", "loss_before",
+    "pose_delta", "pose_moments", "pose_steps", "visits", "visits_here", "loss_fast", "loss_slow", "loss_before",
 )  # fmt: skip
 
 
@@ -160,12 +159,7 @@ def merge(mapper: OnlineMapper, results: Sequence[Result]) -> None:
     mapper.state.become({name: torch.cat([part[name] for part in tensors]) for name in tensors[0]})
     for row in rows:
         for name in LEARNED:
-            value = row[name]
-            if name == "exposure":
-                value = torch.from_numpy(value).to(mapper.state.device)
-            elif name == "exposure_moments":
-                value = tuple(torch.from_numpy(moment.copy()).to(mapper.state.device) for moment in value)
-            setattr(known[row["index"]], name, value)
+            setattr(known[row["index"]], name, row[name])
     mapper.keyframes.owed.count(mapper.keyframes.with_image)
     mapper.trainer.rate = min(result.rate for result in results)
     for result in results:

@@ -1,6 +1,6 @@
 """Blocks on a Ray cluster that the user started and named: one a machine at a time, with all of its cores.
 
-Ray is an extra (`pip install mvsgs[ray]`). Its members trust each other: who reaches its port runs code on all of them,
+Ray is an extra, `ray` in pyproject.toml. Its members trust each other: who reaches its port runs code on all of them,
 and what they exchange is pickled, by Ray. So none is started or looked for here.
 """
 

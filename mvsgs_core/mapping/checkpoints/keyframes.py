@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from mvsgs_core.array_file import Arrays
+from mvsgs_core.geometry import twist_scaled
 from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, checkpoint_info, read_state
 from mvsgs_core.mapping.checkpoints.images import read_image
 from mvsgs_core.mapping.checkpoints.state import keyframe_rows
@@ -51,7 +52,7 @@ def kept_keyframes(output: Path | str) -> list[KeptKeyframe]:
         found = [
             KeptKeyframe(
                 row["index"], row["timestamp"], row["intrinsics"], row["world_from_cam"], int(part["segment"]),
-                row["measured"], row["velocity"] * ([float(part["unit"] or 1.0)] * 3 + [1.0] * 3),
+                row["measured"], twist_scaled(row["velocity"], float(part["unit"] or 1.0)),
                 row["readout_time"], row["reads_columns"], file.parent / KEYFRAMES, row["file"],
             )
             for k, part in enumerate(meta["mappers"])

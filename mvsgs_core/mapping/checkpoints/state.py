@@ -13,15 +13,14 @@ import torch
 from mvsgs_core.array_file import Arrays
 from mvsgs_core.devices import resolve_device
 from mvsgs_core.mapping.between import BetweenView
-from mvsgs_core.mapping.checkpoints.waiting import INDEX as WAITING
 from mvsgs_core.mapping.checkpoints.waiting import waiting_arrays, waiting_of
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.exposure import ImageFormation
 from mvsgs_core.mapping.keyframe_store import awake
-from mvsgs_core.mapping.keyframes import TrainingView
+from mvsgs_core.mapping.keyframes import TrainingView, exposure_of
 from mvsgs_core.mapping.map_state import PARAMETERS, MapState
 from mvsgs_core.mapping.mapper import OnlineMapper
-from mvsgs_core.mapping.resting_images import rest
+from mvsgs_core.mapping.resting_images import bytes_of, rest, room_of
 from mvsgs_core.photometry import is_exposure, is_vignetting
 from mvsgs_core.stats import Stats
 
@@ -36,8 +35,7 @@ SPLATS: dict[str, tuple[type, tuple[int, ...]]] = {  # N splats: dtype and shape
 VIEWS: dict[str, tuple[type, tuple[int, ...]]] = {  # K keyframes: as in TrainingView
     "index": (np.int64, ()), "timestamp": (np.float64, ()), "world_from_cam": (np.float64, (4, 4)),
     "scale": (np.float64, ()), "local_from_cam": (np.float64, (4, 4)), "image_intrinsics": (np.float64, (4,)),
-    "image_size": (np.int64, (2,)), "exposure": (np.float32, (3, 4)), "exposure_moments": (np.float32, (2, 3, 4)),
-    "measured": (np.float32, (3, 4)),
+    "image_size": (np.int64, (2,)), "measured": (np.float32, (3, 4)),
     "pose_delta": (np.float64, (4, 4)), "pose_moments": (np.float64, (2, 6)), "pose_steps": (np.int64, ()),
     "velocity": (np.float64, (6,)), "readout_time": (np.float64, ()), "reads_columns": (np.bool_, ()),
     "as_taken": (np.bool_, ()),
@@ -52,7 +50,6 @@ BETWEEN = VIEWS | {  # frames between keyframes, as in BetweenView
     "twist": (np.float64, (6,)),
 }  # fmt: skip
 NEVER_BELOW_0 = ("pose_steps", "visits", "visits_here", "median_depth", "mean_color")
-LATER = ("reads_columns", "mean_color", WAITING)  # which earlier versions knew nothing of: 0, or none
 MAY_BE_NAN = ("timestamp", "loss_fast", "loss_slow", "loss_before", "measured")
 
 
@@ -126,19 +123,18 @@ def unpack(
     device = torch.device(resolve_device(config.device))
     rows = keyframe_rows(arrays.of("views"), meta.get("images"))
     frames = keyframe_rows(arrays.of("between"), meta.get("between"), BETWEEN)
-    shown = sorted(row["index"] for row in (*rows, *frames) if row["file"])
     left = meta.get("current") is False  # the stream has gone on in another map
     count = awake(config.images_in_memory, config.window) if not left else config.window
-    resting = set(shown[: max(0, len(shown) - count)])
-
-    def taken(row: dict[str, Any], kind: type[V]) -> V:
-        rests = row["index"] in resting
-        view = _view(row, device, torch.device("cpu") if rests else device, image, kind)
-        if rests:
+    made, held, room = dict[int, TrainingView](), 0, room_of(device)
+    for row in sorted((*rows, *frames), key=lambda row: row["index"], reverse=True):
+        view = made[id(row)] = _view(row, device, image, BetweenView if "keyframe" in row else TrainingView)
+        count, held = count - view.has_image, held + bytes_of(view)
+        if view.has_image and (count < 0 or held > room):
             rest(view, log)
-        return view
-
-    views, between = [taken(row, TrainingView) for row in rows], [taken(row, BetweenView) for row in frames]
+        else:
+            view.image, view.valid = view.image.to(device), None if view.valid is None else view.valid.to(device)
+    views = [made[id(row)] for row in rows]
+    between = [view for row in frames if isinstance(view := made[id(row)], BetweenView)]
     if not {view.keyframe for view in between} <= {view.index for view in views} or not all(
         b.has_image for b in between
     ):
@@ -212,10 +208,7 @@ def keyframe_rows(
     """The values of each keyframe's TrainingView, and the `file` of its image. Raises ValueError for damage."""
     count = len(arrays.take("index", np.int64, (None,)))
     columns = {
-        name: np.zeros((count, *shape), dtype)
-        if name in LATER and name not in arrays
-        else arrays.take(name, dtype, (count, *shape), nan=name in MAY_BE_NAN)
-        for name, (dtype, shape) in kept.items()
+        name: arrays.take(name, dtype, (count, *shape), nan=name in MAY_BE_NAN) for name, (dtype, shape) in kept.items()
     }
     sensible = all((columns[n] >= 0).all() for n in NEVER_BELOW_0)
     if not (sensible and (columns["image_size"] > 0).all() and (columns["scale"] > 0).all()):
@@ -229,16 +222,15 @@ def keyframe_rows(
 
 
 def _view(
-    row: dict[str, Any], device: torch.device, image_on: torch.device,
+    row: dict[str, Any], device: torch.device,
     image: Callable[[str, torch.device], tuple[torch.Tensor, torch.Tensor | None]], kind: type[V],
 ) -> V:  # fmt: skip
-    """image_on: the device of its image, which the row, kept by whoever has it, must not hold."""
+    """With its image, which the row, kept by whoever has it, must not hold, on the CPU."""
     row = dict(row)
-    row["image"], row["valid"] = image(row.pop("file"), image_on)
+    row["image"], row["valid"] = image(row.pop("file"), torch.device("cpu"))
     row["image_size"] = tuple(row["image_size"].tolist())
-    row["exposure"] = torch.from_numpy(row["exposure"]).to(device)
     row["measured"] = None if np.isnan(row["measured"]).any() else row["measured"]
-    row["exposure_moments"] = tuple(torch.from_numpy(moment.copy()).to(device) for moment in row["exposure_moments"])
+    row["exposure"] = exposure_of(row["measured"], device)
     return kind(**row)
 
 
@@ -260,22 +252,15 @@ def columns(
 
 def _copied(view: V) -> V:
     """On the CPU; images are shared, as they never change."""
-    first, second = (moment.to("cpu", copy=True) for moment in view.exposure_moments)
     return replace(
-        view, exposure=view.exposure.detach().to("cpu", copy=True), exposure_moments=(first, second),
-        pose_delta=view.pose_delta.copy(), pose_moments=view.pose_moments.copy(), velocity=view.velocity.copy(),
+        view, exposure=view.exposure.to("cpu", copy=True), pose_delta=view.pose_delta.copy(),
+        pose_moments=view.pose_moments.copy(), velocity=view.velocity.copy(),
     )  # fmt: skip
 
 
 def _plain(value: Any, shape: tuple[int, ...]) -> Any:
     """As numpy takes it; None is NaN."""
-    if value is None:
-        return np.full(shape, np.nan)
-    if isinstance(value, torch.Tensor):
-        return value.detach().cpu().numpy()
-    if isinstance(value, tuple):
-        return [_plain(part, shape) for part in value]
-    return value
+    return np.full(shape, np.nan) if value is None else value
 
 
 def _object(value: Any) -> dict[str, Any]:

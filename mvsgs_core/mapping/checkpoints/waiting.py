@@ -10,7 +10,7 @@ from mvsgs_core.array_file import Arrays
 from mvsgs_core.mapping.coarse import Kept
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView
 
-INDEX = "waiting"  # array of their keyframes, in the order in which they wait; earlier versions wrote none
+INDEX = "waiting"  # array of their keyframes, in the order in which they wait
 ROWS: dict[str, type] = {"scale": np.float64, "unit": np.float64, "none": np.bool_}
 
 
@@ -31,8 +31,6 @@ def waiting_arrays(waiting: Sequence[Kept]) -> dict[str, np.ndarray]:
 
 def waiting_of(arrays: Arrays, views: Sequence[TrainingView]) -> list[Kept]:
     """Of a map with these keyframes. Raises ValueError for damage."""
-    if INDEX not in arrays:
-        return []
     index, within, known = arrays.take(INDEX, np.int64, (None,)), arrays.of(INDEX), {v.index: v for v in views}
     if len(set(index.tolist())) < len(index) or not set(index.tolist()) <= known.keys():
         raise ValueError("keyframes that wait for their splats are not there")
@@ -62,4 +60,4 @@ def _kept(arrays: Arrays, view: TrainingView, scale: float, unit: float, none: b
     return Kept(keyframe, unit, none, image)
 
 
-__all__ = ["INDEX", "waiting_arrays", "waiting_of"]
+__all__ = ["waiting_arrays", "waiting_of"]

@@ -14,7 +14,7 @@ import torch
 import triton
 from torch import Tensor
 
-from mvsgs_core.rasterizer.differentiable import Images, Rendered
+from mvsgs_core.rasterizer.differentiable import Images, OnImages, Rendered
 from mvsgs_core.rasterizer.interface import RenderSettings
 from mvsgs_core.rasterizer.triton.blend import SUMS, TILE, blend, blend_backward
 from mvsgs_core.rasterizer.triton.lists import Lists, emit, sort_by_tile
@@ -60,7 +60,7 @@ def projected(parameters: list[Tensor], settings: RenderSettings) -> Pass:
     tiles = tiles_y * tiles_x
     camera = settings.pose.detach().reshape(-1).to(device)
     rows, footprints = means.new_empty(count, ROW), means.new_empty(count, FOOTPRINT)
-    depths, radii = means.new_empty(2, count).unbind(0)
+    depths, radii = means.new_empty(count), means.new_empty(count)  # rows of one would not lie at multiples of 16 bytes
     pairs = torch.empty(count, dtype=torch.int32, device=device)
     programs = triton.cdiv(count, BLOCK)
     refused = torch.zeros(max(1, programs), dtype=torch.int32, device=device)
@@ -102,24 +102,20 @@ def forward(settings: RenderSettings, parameters: list[Tensor]) -> tuple[Images,
         height, width = settings.size
         tiles_y, tiles_x = tile_grid(settings.size)
         color = means.new_empty(height, width, 3)
-        depth, opacity = means.new_empty(2, height, width).unbind(0)
-        weights = means.new_zeros(2, len(lists.pair_splats) if settings.weights else 1)
+        depth, opacity = means.new_empty(height, width), means.new_empty(height, width)
+        weights = means.new_zeros(len(lists.pair_splats) if settings.weights else 1)
         blend[(tiles_y * tiles_x,)](
-            passed.rows, lists.pair_splats, lists.pair_slots, lists.tile_begin, color, depth, opacity, weights[0],
-            weights[1], *settings.background, height, width, tiles_x, EXACT=settings.exact, WEIGHTS=settings.weights,
-            ROW=ROW, **LAUNCH_TILE,
+            passed.rows, lists.pair_splats, lists.pair_slots, lists.tile_begin, color, depth, opacity, weights,
+            *settings.background, height, width, tiles_x, EXACT=settings.exact, WEIGHTS=settings.weights, ROW=ROW,
+            **LAUNCH_TILE,
         )  # fmt: skip
-        weight_sum = weight_max = None
-        if settings.weights:
-            weight_sum = lists.sums(weights[0][:, None])[:, 0]
-            weight_max = lists.sums(weights[1][:, None], maximum=True)[:, 0]
-        return (color, depth, opacity), Rendered(passed.radii, passed.refused, weight_sum, weight_max, passed)
+        weight_max = lists.sums(weights[:, None], maximum=True)[:, 0] if settings.weights else None
+        return (color, depth, opacity), Rendered(passed.radii, passed.refused, weight_max, passed)
 
 
 def backward(
-    settings: RenderSettings, kept: Pass, parameters: list[Tensor], images: Images,
-    on_images: tuple[Tensor, Tensor | None, Tensor | None], on_splats: list[Tensor], on_means2d: Tensor,
-    wants_pose: bool,
+    settings: RenderSettings, kept: Pass, parameters: list[Tensor], images: Images, on_images: OnImages,
+    on_splats: list[Tensor], on_means2d: Tensor, wants_pose: bool,
 ) -> tuple[Tensor | None, None]:  # fmt: skip
     """See `BackEnd`."""
     with torch.cuda.device_of(on_means2d):

@@ -14,6 +14,7 @@ import triton
 import triton.language as tl
 
 from mvsgs_core.rasterizer import interface, kernels
+from mvsgs_core.rasterizer.triton.lists import SIZES
 
 # A pair's sums: red, green, blue, depth, log opacity, u, v, u u, u v, v v, beta; see projection_backward.
 SUMS = 11
@@ -52,13 +53,13 @@ def _shape(row, x, y, EXACT: tl.constexpr):  # type: ignore[no-untyped-def]
     return u, v, m, log2_m, power, tl.load(row + 7) - power * HALF_LOG2E
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def blend(  # type: ignore[no-untyped-def]
-    rows, pair_splats, pair_slots, tile_begin, color, depth, opacity, weight_sums, weight_maxima,
+    rows, pair_splats, pair_slots, tile_begin, color, depth, opacity, weight_maxima,
     red_behind, green_behind, blue_behind, height, width, tiles_x,
     EXACT: tl.constexpr, WEIGHTS: tl.constexpr, ROW: tl.constexpr,
 ):  # fmt: skip
-    """color (H, W, 3), depth and opacity (H, W); with WEIGHTS the sum and maximum of each pair's, (P,), 0 before."""
+    """color (H, W, 3), depth and opacity (H, W); with WEIGHTS the largest of each pair's, (P,), 0 before."""
     tile = tl.program_id(0)
     x, y, at, inside = _pixels(tile, height, width, tiles_x)
     left = tl.where(inside, 1.0, 0.0)
@@ -80,9 +81,7 @@ def blend(  # type: ignore[no-untyped-def]
         blue += weight * tl.load(row + 10)
         sum_z += weight * tl.load(row + 11)
         if WEIGHTS:
-            slot = tl.load(pair_slots + index)
-            tl.store(weight_sums + slot, tl.sum(weight, axis=0))
-            tl.store(weight_maxima + slot, tl.max(weight, axis=0))
+            tl.store(weight_maxima + tl.load(pair_slots + index), tl.max(weight, axis=0))
         left -= weight
         index += 1
         if index % 4 == 0:  # noqa: SIM102  # `and` computes both for every pair
@@ -96,7 +95,7 @@ def blend(  # type: ignore[no-untyped-def]
     tl.store(opacity + at, covered, mask=inside)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def blend_backward(  # type: ignore[no-untyped-def]
     rows, pair_splats, pair_slots, tile_begin, color, depth, opacity, on_color, on_depth, on_opacity, sums,
     height, width, tiles_x, EXACT: tl.constexpr, DEPTH: tl.constexpr, SUMS: tl.constexpr, ROW: tl.constexpr,

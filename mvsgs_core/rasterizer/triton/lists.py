@@ -15,6 +15,9 @@ from torch import Tensor
 
 MARGIN = tl.constexpr(0.01)  # px, so that rounding never cuts a pixel off the ellipse
 FAR = tl.constexpr(1 << 23)  # beyond every column of pixels
+# Arguments that a kernel is compiled for once. By itself Triton compiles it anew for 1 and for multiples of 16: each
+# keyframe's new splats may make their number one.
+SIZES = ("count", "height", "width", "tiles_x", "tiles")
 
 
 @triton.jit
@@ -64,7 +67,7 @@ def row_span(  # type: ignore[no-untyped-def]
     return first // 4, tl.where(last < 0, -1, last // 4)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def emit(  # type: ignore[no-untyped-def]
     order, rows, footprints, radii, slots, pairs, pair_tiles, pair_splats, count, width, height,
     tiles_x, tiles, BLOCK: tl.constexpr, ROW: tl.constexpr, FOOTPRINT: tl.constexpr,
@@ -118,7 +121,7 @@ def emit(  # type: ignore[no-untyped-def]
         step += 1
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def per_splat(  # type: ignore[no-untyped-def]
     values, slots, pairs, result, count, COLUMNS: tl.constexpr, WIDTH: tl.constexpr, MAXIMUM: tl.constexpr,
     SPLATS: tl.constexpr, AT_ONCE: tl.constexpr,

@@ -11,7 +11,7 @@ import triton.language as tl
 
 from mvsgs_core.rasterizer import interface, kernels
 from mvsgs_core.rasterizer.triton.harmonics import basis
-from mvsgs_core.rasterizer.triton.lists import row_span, tile_rows
+from mvsgs_core.rasterizer.triton.lists import SIZES, row_span, tile_rows
 
 # A splat on the image. With d = pixel - mean: u = pitch_u (dx - shear dy), v = pitch_v dy, m = u^2 + v^2. The mean is
 # whole + part, so that dx keeps its precision far from the corner.
@@ -137,7 +137,7 @@ def opacity_of(logit, sharp, determinant, ANTIALIASED: tl.constexpr):  # type: i
     return sigmoid, compensation
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def project(  # type: ignore[no-untyped-def]
     means, log_scales, quaternions, opacity_logits, sh, betas, camera, rows, footprints, depths, radii, pairs, refused,
     count, width, height, fx, fy, cx, cy, by_x, by_y, by_z, about_x, about_y, about_z, near,

@@ -6,6 +6,7 @@ import triton
 import triton.language as tl
 
 from mvsgs_core.rasterizer.triton.harmonics import basis, basis_gradient
+from mvsgs_core.rasterizer.triton.lists import SIZES
 from mvsgs_core.rasterizer.triton.projection import (
     BLUR,
     MAX_BETA,
@@ -53,7 +54,7 @@ def _axis_gradient(  # type: ignore[no-untyped-def]
     return on_s, on_t
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def project_backward(  # type: ignore[no-untyped-def]
     means, log_scales, quaternions, opacity_logits, sh, betas, camera, rows, totals, pairs,
     on_means, on_log_scales, on_quaternions, on_logits, on_sh, on_betas, on_means2d, on_pose,

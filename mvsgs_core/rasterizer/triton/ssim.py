@@ -38,7 +38,7 @@ def _row_taps(taps, rows, source):  # type: ignore[no-untyped-def]
     return tl.load(taps + tap, mask=(tap >= 0) & (tap <= 2 * RADIUS), other=0.0)[:, None]
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["height"])
 def similarity(  # type: ignore[no-untyped-def]
     image, target, taps, on_a, on_p, on_r, sums, height, length, ROWS: tl.constexpr, COLUMNS: tl.constexpr
 ):
@@ -89,7 +89,7 @@ def similarity(  # type: ignore[no-untyped-def]
     tl.store(sums + program, tl.sum(tl.sum(tl.where(inside, s, 0.0), axis=1), axis=0))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["height"])
 def loss_gradient(  # type: ignore[no-untyped-def]
     image, target, pixel_weight, taps, on_a, on_p, on_r, gradient, sums, height, length,
     l1_weight, l1_scale, ssim_scale, WEIGHTED: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr,
@@ -140,8 +140,8 @@ def loss_with_gradient(
         grid = (triton.cdiv(height, ROWS), triton.cdiv(length, COLUMNS))
         taps = window(image.device)
         gradient = torch.empty_like(image)
-        on_a, on_p, on_r = image.new_empty(3, height, length).unbind(0)
-        similar, different = image.new_empty(2, grid[0] * grid[1]).unbind(0)
+        on_a, on_p, on_r = (torch.empty_like(image) for _ in range(3))
+        similar, different = (image.new_empty(grid[0] * grid[1]) for _ in range(2))
         block = {"ROWS": ROWS, "COLUMNS": COLUMNS, "enable_fp_fusion": True}
         similarity[grid](image, target, taps, on_a, on_p, on_r, similar, height, length, **block)
         per_value = 1.0 / image.numel()

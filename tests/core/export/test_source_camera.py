@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from mvsgs_core.export.cameras import read_cameras, read_source_camera, write_ca
 from mvsgs_core.export.source_camera import (
     FACTOR,
     LENS,
+    PHOTOGRAPHS,
     SourceCamera,
     camera_of,
     camera_values,
@@ -54,6 +56,21 @@ def test_a_guess_takes_the_trackers_factor_and_says_how_sure_it_is() -> None:
     assert "doubtful" not in camera.text()
 
 
+@pytest.mark.parametrize("lens", [GUESS, replace(GUESS, guessed=False)])
+def test_photographs_have_the_lens_that_they_were_mapped_with(lens: Lens) -> None:
+    """Their tracker starts from what is given, too."""
+    camera = source_camera(said(lens, **{PHOTOGRAPHS: [0.9, -0.08, 0.01]}))
+    assert camera is not None
+    assert (camera.origin, camera.focal_sigma, camera.doubt) == ("estimated", None, "")
+    fx, fy, cx, cy = GUESS.intrinsics
+    assert camera.lens.intrinsics == pytest.approx((0.9 * fx, 0.9 * fy, cx, cy))
+    assert camera.lens.distortion == (-0.08, 0.01, 0.0, 0.0)
+    assert camera_of(camera_values(camera)) == camera
+    given = source_camera(said(PHONE, **{PHOTOGRAPHS: [0.9, -0.08, 0.01]}))
+    assert given is not None
+    assert given.lens.distortion == PHONE.distortion  # that was taken out of them before
+
+
 def test_a_guess_that_stays_one_is_doubted() -> None:
     kept = source_camera(said(GUESS, factor=1.0, focal_doubt="it can't be told"))
     assert kept is not None
@@ -68,6 +85,7 @@ def test_a_guess_that_stays_one_is_doubted() -> None:
     [
         {}, {"dataset": {"values": {}}}, {"dataset": 3}, said(GUESS, factor="x", focal_sigma_percent=1.0),
         said(GUESS, factor=float("nan"), focal_sigma_percent=1.0), said(GUESS, readout_time=-1.0),
+        said(GUESS, **{PHOTOGRAPHS: [1.0, 2.0]}), said(GUESS, **{PHOTOGRAPHS: 3}),
         {"dataset": {"values": {LENS: {**lens_values(PHONE), "intrinsics": [1.0, 2.0]}}}},
         {"dataset": {"values": {LENS: {**lens_values(PHONE), "size": [1e400, 2]}}}},
     ],
@@ -82,8 +100,6 @@ def test_a_camera_may_be_held_in_any_way(reads_columns: bool, line: str) -> None
     assert camera == SourceCamera(PHONE, "given", None, "", -0.018, reads_columns=reads_columns)
     assert camera.text().endswith(f"rolling shutter of 18.0 ms, the last {line} first")
     assert camera_of(camera_values(camera)) == camera
-    earlier = {name: value for name, value in camera_values(camera).items() if name != "reads_columns"}
-    assert not camera_of(earlier).reads_columns
 
 
 def test_it_comes_back_from_cameras_json_and_is_no_keyframe(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import torch
 
 from mvsgs_core.evaluation.scoring import ScoredFrame, render_frame
 from mvsgs_core.export.ply import read_ply, write_ply
-from mvsgs_core.mapping.background import background_of
+from mvsgs_core.mapping.background import Background
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.insertion import InsertionConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
@@ -42,10 +42,10 @@ def test_it_is_the_mean_of_the_images_where_they_count() -> None:
     mapper = mapped([replace(views[0], mask=mask), views[1]], replace(CONFIG, iterations=1, refinement=0))
     colors = [views[0].image[mask].mean(axis=0), views[1].image.reshape(-1, 3).mean(axis=0)]
     np.testing.assert_allclose(mapper.trainer.background, np.mean(colors, axis=0) / 255.0, atol=1e-6)
-    assert background_of([]) is None
+    assert Background().color is None
     nothing = replace(mapper.views[0], mean_color=np.zeros(3))
-    assert background_of([nothing]) is None
-    np.testing.assert_allclose(background_of([nothing, mapper.views[1]]), colors[1] / 255.0, atol=1e-6)
+    assert Background([nothing]).color is None
+    np.testing.assert_allclose(Background([nothing, mapper.views[1]]).color, colors[1] / 255.0, atol=1e-6)
 
 
 def test_exposures_are_undone_and_follow_corrections() -> None:

@@ -15,17 +15,16 @@ import pytest
 import torch
 
 from mvsgs_core.mapping.atlas import Atlas
-from mvsgs_core.mapping.background import background_of
 from mvsgs_core.mapping.checkpoints.checkpoint import load
 from mvsgs_core.mapping.checkpoints.files import (
     FOLDER,
     KEYFRAMES,
+    VERSION,
     checkpoint_info,
     read_state,
     state_files,
 )
 from mvsgs_core.mapping.checkpoints.keyframes import kept_keyframes
-from mvsgs_core.mapping.checkpoints.state import LATER
 from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
 from mvsgs_core.mapping.density_control import DensityControlConfig
@@ -278,8 +277,7 @@ def test_no_mutated_value_raises_anything_but_a_value_error(tmp_path: Path, monk
     for name, value in arrays.items():
         if name.startswith("map1"):
             continue  # as map0
-        if name.rpartition("/")[2] not in LATER:  # see test_what_an_earlier_version_did_not_write_is_not_missed
-            bad.append((meta, {k: v for k, v in arrays.items() if k != name}))
+        bad.append((meta, {k: v for k, v in arrays.items() if k != name}))
         bad.append((meta, {**arrays, name: value.astype(np.complex64)}))
         bad.append((meta, {**arrays, name: value[..., None]}))
         if value.dtype.kind == "f" and value.size:
@@ -303,44 +301,12 @@ def test_no_mutated_value_raises_anything_but_a_value_error(tmp_path: Path, monk
     assert len(taken) < 6
 
 
-def test_what_an_earlier_version_did_not_write_is_not_missed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rows are read out one after the other, and what is behind the splats is black until a keyframe comes."""
-    meta, arrays = read_state(state_files(written(begun(EVERYTHING), tmp_path))[0])
-    del meta["format"], meta["version"]
-    earlier = {name: value for name, value in arrays.items() if name.rpartition("/")[2] not in LATER}
-    assert len(earlier) < len(arrays)
-    read = json.loads(json.dumps(meta)), earlier
-    monkeypatch.setattr("mvsgs_core.mapping.checkpoints.files.read_arrays", lambda *_: read)
-    mapper = load(tmp_path, EVERYTHING, Stats())[0].current
-    assert not any(known.reads_columns for known in mapper.views)
-    assert mapper.trainer.background is None
-    mapper.add_keyframe(view(6))
-    known = background_of(mapper.views[-1:])
-    assert known is not None
-    np.testing.assert_array_equal(mapper.trainer.background, known)
-
-
 def test_another_version_is_refused_by_its_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mvsgs_core.mapping.checkpoints.files.VERSION", 9)
+    monkeypatch.setattr("mvsgs_core.mapping.checkpoints.files.VERSION", VERSION + 1)
     written(begun(PLAIN), tmp_path)
     monkeypatch.undo()
-    with pytest.raises(ValueError, match="version 9 of the format"):
+    with pytest.raises(ValueError, match=f"version {VERSION + 1} of the format"):
         load(tmp_path, PLAIN, Stats())
-
-
-def test_an_earlier_one_says_nothing_of_columns_and_its_cameras_read_rows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    atlas = begun(PLAIN)
-    for k in atlas.current.views:
-        k.reads_columns = True
-    meta, arrays = read_state(state_files(written(atlas, tmp_path))[0])
-    del meta["format"], meta["version"]
-    assert any(k.reads_columns for k in kept_keyframes(tmp_path))
-    earlier = meta, {name: value for name, value in arrays.items() if not name.endswith("/reads_columns")}
-    monkeypatch.setattr("mvsgs_core.mapping.checkpoints.files.read_arrays", lambda *_: earlier)
-    found, _ = load(tmp_path, PLAIN, Stats())
-    assert {k.reads_columns for k in found.current.views} == {False}
 
 
 def test_numpy_reads_it_without_pickle(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import torch
 from mvsgs_core.mapping import densifier
 from mvsgs_core.mapping.densifier import noise_variance
 from mvsgs_core.mapping.density_control import DensityControlConfig
-from mvsgs_core.mapping.keyframes import RGBDKeyframe
+from mvsgs_core.mapping.keyframes import RGBDKeyframe, training_view
 from mvsgs_core.mapping.mapper import OnlineMapper
 from tests.support.small_maps import CONFIG
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
@@ -38,6 +39,30 @@ def test_a_noisy_keyframe_gets_fewer_splats_than_one_whose_noise_is_not_known(mo
     with_noise = second(8.0)
     monkeypatch.setattr(densifier, "noise_variance", lambda squared: 0.0)
     assert 0 < with_noise < 0.95 * second(8.0)
+
+
+def test_what_a_mask_covers_is_no_part_of_the_usual_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    mapper = OnlineMapper(CONFIG)
+    keyframe = rgbd_keyframe(0, pose_on_arc(0.0))
+    mapper.add_keyframe(keyframe)
+    view = training_view(keyframe, keyframe.world_from_cam, None, torch.device("cpu"))
+    image, valid = view.target.numpy(), np.ones(view.size, dtype=bool)
+    noise = np.random.default_rng(0).normal(0.0, 0.01, image.shape)
+    shown = (image + noise).astype(np.float32)
+    shown[:8, -8:] += 0.2  # what the map has wrong
+    solid = torch.ones(view.size)
+
+    def residual(color: np.ndarray, valid: np.ndarray) -> np.ndarray:
+        render = SimpleNamespace(color=torch.from_numpy(color), opacity=solid, depth=solid)
+        monkeypatch.setattr(mapper.densifier, "render", lambda _: render)
+        return mapper.densifier._residual(view, image, valid)[0][:8, -8:]
+
+    columns = round(0.6 * view.size[1])
+    covered = shown.copy()
+    covered[:, :columns], valid[:, :columns] = 1.0 - image[:, :columns], False
+    whole = residual(shown, np.ones_like(valid))
+    assert whole.min() > 0.01
+    np.testing.assert_allclose(residual(covered, valid), whole, rtol=0.05)
 
 
 def test_a_full_map_says_so_in_one_sentence() -> None:

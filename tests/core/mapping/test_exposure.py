@@ -206,16 +206,6 @@ def test_a_common_change_of_gauge_changes_no_render_and_a_late_exposure_is_as_on
     np.testing.assert_array_equal(late.views[0].exposure.numpy(), IDENTITY)
 
 
-def test_what_a_keyframe_learned_beside_the_measured_exposure_stays_with_a_correction() -> None:
-    mapper = mapped([photographed(arc(0.0)[0], AFFINE)], CONFIG)
-    view = mapper.views[0]
-    trained = compose(AFFINE, np.array([[1.02, 0, 0, 0], [0, 0.99, 0, 0], [0, 0, 1, 0]]))
-    view.exposure = torch.tensor(trained, dtype=torch.float32)
-    change = view.expose(DIM)
-    np.testing.assert_allclose(compose(view.exposure.numpy(), change), trained, atol=1e-6)
-    np.testing.assert_array_equal(view.measured, DIM)
-
-
 @pytest.mark.parametrize("value", [np.inf, 1e9, 0.0, -np.inf])
 def test_what_no_camera_has_is_refused_and_counted_and_the_map_stays_sound(value: float) -> None:
     wrong = IDENTITY.copy()

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from mvsgs_core.mapping.background import background_of
+from mvsgs_core.mapping.background import Background
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.mapper import OnlineMapper
@@ -31,7 +31,7 @@ def check(mapper: OnlineMapper) -> None:
     """To the bit."""
     depths = [known.median_depth for known in mapper.views if known.median_depth > 0]
     assert mapper.median_depth == (statistics.median(depths) if depths else 1.0)
-    expected = background_of(mapper.views)
+    expected = Background(mapper.views).color
     assert (expected is None) == (mapper.trainer.background is None)
     if expected is not None:
         np.testing.assert_array_equal(mapper.trainer.background, expected)

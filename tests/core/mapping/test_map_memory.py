@@ -16,7 +16,8 @@ import torch
 
 from mvsgs_core.export.ply import read_ply, write_ply
 from mvsgs_core.export.snapshot import Snapshot
-from mvsgs_core.mapping.deformation import Similarity, move_with_anchors
+from mvsgs_core.geometry import Similarity
+from mvsgs_core.mapping.deformation import move_with_anchors
 from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.rasterizer.splats import Splats
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from mvsgs_core import geometry
-from mvsgs_core.mapping.deformation import Similarity, move_with_anchors
+from mvsgs_core.mapping.deformation import move_with_anchors
 from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.sh_rotation import sh_rotation
@@ -35,7 +35,7 @@ def test_the_anchor_sees_the_same_image_after_a_correction_with_scale() -> None:
     state = MapState(9, torch.device("cpu"))
     state.append(splats_before(OLD), torch.full((40,), 7))
     before = rasterize(state.detached(), OLD, INTRINSICS, (24, 32), backend="reference")
-    assert move_with_anchors(state, {7: Similarity.between(OLD, NEW, 1.7)}) == 40
+    assert move_with_anchors(state, {7: geometry.Similarity.between(OLD, NEW, 1.7)}) == 40
     after = rasterize(state.detached(), NEW, INTRINSICS, (24, 32), backend="reference")
     assert before.opacity.mean() > 0.2
     torch.testing.assert_close(after.color, before.color, atol=2e-4, rtol=0)
@@ -46,7 +46,8 @@ def test_only_the_named_anchors_move() -> None:
     state = MapState(9, torch.device("cpu"))
     state.append(splats_before(OLD), torch.arange(40) % 4)
     before = state.detached().means.clone()
-    assert move_with_anchors(state, {2: Similarity.between(OLD, NEW, 1.0), 9: Similarity.between(OLD, NEW, 1.0)}) == 10
+    change = geometry.Similarity.between(OLD, NEW, 1.0)
+    assert move_with_anchors(state, {2: change, 9: change}) == 10
     moved = (state.detached().means != before).any(dim=1)
     assert torch.equal(moved, torch.arange(40) % 4 == 2)
 
@@ -56,7 +57,7 @@ def test_moments_follow_the_change_of_variables() -> None:
     state = MapState(9, torch.device("cpu"))
     state.append(splats_before(OLD), torch.full((40,), 1))
     target = torch.randn((40, 3), generator=torch.Generator().manual_seed(5))
-    similarity = Similarity.between(OLD, NEW, 1.7)
+    similarity = geometry.Similarity.between(OLD, NEW, 1.7)
     old_means = state.detached().means.clone().requires_grad_(True)
     (torch.sin(old_means) * target).sum().backward()
     state.first["means"] = old_means.grad.clone()

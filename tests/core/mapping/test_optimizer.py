@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from mvsgs_core.mapping import optimizer
 from mvsgs_core.mapping.map_state import PARAMETERS, MapState
@@ -56,6 +57,28 @@ def test_kernel_equals_its_twin_over_many_steps() -> None:
     for name in PARAMETERS:
         torch.testing.assert_close(getattr(kernel.splats, name), getattr(twin.splats, name), rtol=1e-4, atol=2e-5)
         torch.testing.assert_close(kernel.second[name], twin.second[name], rtol=1e-4, atol=1e-20)
+
+
+class WideFloat64(TorchDispatchMode):
+    """The operations that make a float64 for each value of a splat, not one for the splat."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__()
+        self.count, self.found = count, set[str]()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        if isinstance(result, torch.Tensor) and result.dtype == torch.float64 and result.numel() > self.count:
+            self.found.add(func._schema.name)
+        return result
+
+
+def test_a_gpu_steps_in_float32() -> None:
+    state = random_state(50)
+    set_gradients(state, 1)
+    with WideFloat64(len(state)) as watched:
+        step_reference(state, torch.ones(50, dtype=torch.bool), all_groups(), RATES.decay_steps)
+    assert not watched.found
 
 
 @pytest.mark.parametrize("fraction", [0.1, 0.6, 1.0])

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from mvsgs_core import native
-from mvsgs_core.mapping import partition_plain
 from mvsgs_core.mapping.insertion import InsertionConfig
 from mvsgs_core.mapping.partition import EMPTY, Partition, Split, partition
+from tests.support import partition_plain
 
 SIZE = (48, 64)
 PRICE = InsertionConfig().price

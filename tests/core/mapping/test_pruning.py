@@ -63,6 +63,21 @@ def front(count: int) -> Splats:
 
 
 @pytest.mark.usefixtures("exact")
+def test_an_image_that_shows_a_splat_behind_its_mask_alone_does_not_make_it_cheaper() -> None:
+    splats = front(12)
+    plain = images(splats, (0.0, 0.0))
+    masked = [plain[0], replace(plain[1], valid=torch.zeros(SIZE, dtype=torch.bool))]
+    state = state_of(splats)
+    (by_one, _), (by_both, _) = (
+        removal_cost(state, views, photograph, torch.Generator().manual_seed(0)) for views in ([plain[0]], masked)
+    )
+    shown = torch.isfinite(by_one)
+    assert shown.any()
+    # summed over as many images as there are
+    torch.testing.assert_close(by_both[shown], 2 * by_one[shown], rtol=0.25, atol=0.02 * float(by_one[shown].max()))
+
+
+@pytest.mark.usefixtures("exact")
 def test_the_cost_is_that_of_a_render_without_the_splat() -> None:
     splats = front(12)
     views = images(splats)

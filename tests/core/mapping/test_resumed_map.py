@@ -11,10 +11,11 @@ import pytest
 import torch
 
 from mvsgs_core.mapping.atlas import Atlas
-from mvsgs_core.mapping.checkpoints import checkpoint
+from mvsgs_core.mapping.checkpoints import checkpoint, state
 from mvsgs_core.mapping.checkpoints.begun import begin_on
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.mapping.resting_images import bytes_of
 from mvsgs_core.stats import Stats
 from tests.support.full_disk import full_after
 from tests.support.small_atlas import PLAIN, between, view, written
@@ -65,6 +66,17 @@ def test_images_that_rested_on_disk_go_there_as_they_are_read(tmp_path: Path, mo
             assert one.valid is None or two.valid is None or torch.equal(one.valid, two.valid)
     begun = begin_on(tmp_path, FEW, Stats())
     assert list(resting(begun).values()) == list(expected.values())
+
+
+def test_of_a_gpu_s_memory_they_take_no_more_than_their_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = replace(FEW, images_in_memory=1000)
+    folder = written(mapped(config), tmp_path)
+    plain, _ = checkpoint.load(folder, config, Stats())
+    newest = plain.current.keyframes.trained[-3:]
+    monkeypatch.setattr(state, "room_of", lambda device: bytes_of(newest[1]) + bytes_of(newest[2]) + 1)
+    again, _ = checkpoint.load(folder, config, Stats())
+    assert [view.image_on_disk for view in again.current.keyframes.trained] == [True, False, False]
+    assert all(torch.equal(a.image, b.image) for a, b in zip(newest, again.current.keyframes.trained))
 
 
 def test_where_the_disk_is_full_the_map_is_gone_on_with_in_memory(tmp_path: Path) -> None:

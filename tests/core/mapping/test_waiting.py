@@ -69,11 +69,10 @@ def test_a_map_that_is_gone_on_with_gets_them_where_it_is_now(tmp_path: Path) ->
     np.testing.assert_array_equal(completed(begin_on(tmp_path, LIVE, Stats())) + STREAM, completed(atlas))
 
 
-def test_damage_is_refused_and_an_earlier_version_wrote_none() -> None:
+def test_damage_is_refused() -> None:
     mapper = waiting_atlas().current
     arrays = waiting_arrays(mapper.coarse.kept)
     assert len(waiting_of(Arrays(arrays), mapper.views)) == 3
-    assert waiting_of(Arrays({}), mapper.views) == []
     endless = arrays["waiting/1/depth"].copy()
     endless[0, 0] = np.inf
     for name, value in {

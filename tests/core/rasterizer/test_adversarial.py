@@ -156,8 +156,6 @@ def test_what_does_not_fit_is_refused_with_its_name() -> None:
         rasterize(splats, np.eye(4), camera[:3], SIZE)
     with pytest.raises(ValueError, match="0x5 pixels"):
         rasterize(splats, np.eye(4), camera, (0, 5))
-    with pytest.raises(ValueError, match="degree 2"):
-        rasterize(splats, np.eye(4), camera, SIZE, degree=2)
     with pytest.raises(ValueError, match="exposure"):
         rasterize(splats, np.eye(4), camera, SIZE, exposure=torch.eye(3))
     with pytest.raises(ValueError, match="float64"):

@@ -7,7 +7,7 @@ import torch
 
 from mvsgs_core.rasterizer.ssim import chosen_backend, image_loss
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.gpu]
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 pytest.importorskip("triton", reason="triton is not installed: pip install triton to run its interpreter")

@@ -1,4 +1,5 @@
-"""Every Triton kernel is launched while the GPU of its tensors is the current one: Triton takes the current one's."""
+"""How Triton kernels are launched: while the GPU of their tensors is the current one, which Triton takes; and as one
+variant, whatever their numbers."""
 
 from __future__ import annotations
 
@@ -12,9 +13,10 @@ import torch
 from torch import Tensor
 
 from mvsgs_core.rasterizer.ssim import image_loss
+from tests.support.kernel_variants import Variants
 from tests.support.rasterizer_scenes import copy, device_of, gradients, random_splats
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.gpu]
 
 pytest.importorskip("triton", reason="triton is not installed: pip install triton to run its interpreter")
 
@@ -83,3 +85,12 @@ def test_of_the_loss(monkeypatch: pytest.MonkeyPatch) -> None:
     image_loss(image.requires_grad_(), target, l1_weight=0.8, ssim_weight=0.2, backend="triton").backward()
     assert len(launches.found) == 2
     assert set(launches.found.values()) == {image.device}
+
+
+def test_no_kernel_is_compiled_anew_for_another_number_of_splats_or_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    variants = Variants(monkeypatch)
+    for count, size in ((15, (9, 12)), (16, (9, 12)), (33, (16, 16)), (33, (17, 32))):
+        before = variants.found.copy()
+        gradients(copy(random_splats(count), device=DEVICE), size, backend="triton")
+        assert not before or variants.found == before, (count, size)
+    assert len({name for name, *_ in variants.found}) == 6
