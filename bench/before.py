@@ -37,6 +37,7 @@ from bench.runs import (
     figure,
     folder,
     folder_name,
+    held_out_scores,
     python,
     said,
 )
@@ -161,10 +162,7 @@ def completed(run: Run) -> Run:
 
 def of_common_frames(before: Report, after: Report) -> tuple[float, float, int] | None:
     """PSNR before and after over the frames that are held out in both, and how many they are."""
-    known = [
-        {frame["index"]: frame["psnr"] for frame in report["rendering"].get("frames", ()) if frame["held_out"]}
-        for report in (before, after)
-    ]
+    known = [held_out_scores(report) for report in (before, after)]
     common = sorted(known[0].keys() & known[1].keys())
     if not common:
         return None
@@ -193,9 +191,7 @@ def rows_of(scene: str, before: Sequence[Run], after: Sequence[Run]) -> list[Row
 
 
 def _common_rows(scene: str, before: Iterable[Run], after: Iterable[Run]) -> list[Row]:
-    old = {run.seed: run.report for run in before if run.report}
-    pairs = [of_common_frames(old[run.seed], run.report) for run in after if run.report and run.seed in old]
-    known = np.array([pair for pair in pairs if pair is not None], dtype=float).reshape(-1, 3)
+    known = _common(before, after)
     if not len(known):
         return []
     title = f"Frames that are held out in both: {scene}"
@@ -207,6 +203,18 @@ def _common_rows(scene: str, before: Iterable[Run], after: Iterable[Run]) -> lis
         Row(f"{title}: PSNR, change", float(changes.mean()), "dB", *_goal_of_change(scene, PSNR, changes),
             spread=_spread(changes)),
     ]  # fmt: skip
+
+
+def _common(before: Iterable[Run], after: Iterable[Run]) -> np.ndarray:
+    """(N, 3) of the seeds that both have: as `of_common_frames`."""
+    old = {run.seed: run.report for run in before if run.report}
+    pairs = [of_common_frames(old[run.seed], run.report) for run in after if run.report and run.seed in old]
+    return np.array([pair for pair in pairs if pair is not None], dtype=float).reshape(-1, 3)
+
+
+def _gains(before: Iterable[Run], after: Iterable[Run]) -> list[float]:
+    """dB over the frames that are held out in both, seed by seed."""
+    return [new - old for old, new, _ in _common(before, after).tolist()]
 
 
 def _pairs(shown: Figure, before: Iterable[Run], after: Iterable[Run]) -> Iterable[tuple[float, float]]:
@@ -238,11 +246,12 @@ def _goal_of_change(scene: str, shown: Figure, changes: np.ndarray) -> tuple[str
 
 
 def at_equal_quality(scene: str, before: Sequence[Run], candidates: Mapping[str, Sequence[Run]]) -> list[Row]:
-    """What the cheapest of the candidates costs whose mean PSNR is that of before."""
+    """What the cheapest of the candidates costs whose mean PSNR is that of before, over the frames that are held out in
+    both."""
     good: dict[str, tuple[float, float]] = {}
     for name, runs in candidates.items():
         shares = [[shown.change(*pair) for pair in _pairs(shown, before, runs)] for shown in (SECONDS, SPLATS)]
-        gains = [PSNR.change(*pair) for pair in _pairs(PSNR, before, runs)]
+        gains = _gains(before, runs)
         if gains and all(shares) and np.mean(gains) >= 0.0:
             good[name] = float(np.mean(shares[0])), float(np.mean(shares[1]))
     title = f"At before's PSNR: {scene}"
@@ -259,12 +268,10 @@ def at_equal_quality(scene: str, before: Sequence[Run], candidates: Mapping[str,
 def at_equal_time(scene: str, before: Sequence[Run], candidates: Mapping[str, Sequence[Run]]) -> list[Row]:
     """What the best of the candidates gains whose mapper takes no more processor time than that of before (by no more
     than the spread over the seeds), over the frames that are held out in both."""
-    old = {run.seed: run.report for run in before if run.report}
     found: dict[str, tuple[float, float]] = {}
     for name, runs in candidates.items():
         shares = [SECONDS.change(*pair) for pair in _pairs(SECONDS, before, runs)]
-        pairs = [of_common_frames(old[run.seed], run.report) for run in runs if run.report and run.seed in old]
-        gains = [pair[1] - pair[0] for pair in pairs if pair is not None]
+        gains = _gains(before, runs)
         if gains and shares and np.mean(shares) <= 1.0 + (_spread(np.array(shares)) or 0.0):
             found[name] = float(np.mean(gains)), float(np.mean(shares))
     title = f"At before's processor time: {scene}"

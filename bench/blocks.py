@@ -18,7 +18,7 @@ import torch
 
 from bench.ray_nodes import ray_nodes
 from bench.runs import DATA
-from bench.table import Row, at_least, main, names, timed
+from bench.table import Row, at_least, main, names, skipped, timed
 from launch.compose import compose
 from launch.inline import run_inline
 from msgs import Frame, GroundTruth
@@ -176,7 +176,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     rows, rounds = [], options.rounds if is_installed("ray") else 0
     for name in chosen:
         if name == "kitti_piece" and not (DATA / name).exists():
-            rows.append(Row(f"{name}: skipped", f"{DATA / name} is missing"))
+            rows.append(skipped(name, DATA / name))
             continue
         begun, photographs = made([*MAPS[name], *(["dataset.stop=60"] if options.quick else [])])
         total = 60 if options.quick else options.iterations

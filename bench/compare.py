@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from bench.record import RECORDED, Record, read_rows
-from bench.runs import machine
 from mvsgs_core.evaluation.metrics import DEPTH, IMAGE, TRAJECTORY
+from mvsgs_core.machine import processor
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def change(row: dict[str, Any], before: dict[str, Any], same_machine: bool) -> C
 
 def compare(name: str, rows: list[dict[str, Any]], recorded: Record) -> list[Change]:
     """Changes of one benchmark; a row that is gone is one, a regression."""
-    same = recorded.machine == machine()
+    same = recorded.machine == processor()
     before = {row["name"]: row for row in recorded.rows}
     now = {row["name"]: row for row in rows}
     found = [change(row, before[key], same) for key, row in now.items() if key in before]

@@ -20,7 +20,8 @@ Rows = Callable[[str], list[dict[str, Any]]]  # those recorded of a benchmark, b
 
 @dataclass(frozen=True)
 class Figure:
-    """Two rows of one record, side by side. {ours} and {theirs}: the images of both, from the record's protocol."""
+    """Two rows of one record, side by side. {ours} and {theirs}: the images of both, from the record's protocol;
+    {kept}: the share of the true depths that both keep."""
 
     what: str
     benchmark: str
@@ -32,8 +33,10 @@ class Figure:
     @property
     def rows(self) -> list[str]:
         """Names of the rows that it is made of; what both had stands in the last, where `what` or `baseline` say it."""
-        protocol = f"{self.ours.partition(':')[0]}: protocol"
-        return [self.ours, self.theirs, *([protocol] if "{" in self.what + self.baseline else [])]
+        text, name = self.what + self.baseline, self.ours
+        if "{kept}" in text:
+            return [name, self.theirs, name.removesuffix("inliers") + "completeness"]
+        return [name, self.theirs, *([f"{name.partition(':')[0]}: protocol"] if "{" in text else [])]
 
 
 _REDKITCHEN, _FR1 = "RedKitchen, {ours}", "freiburg1_xyz, {ours}"
@@ -48,10 +51,10 @@ FIGURES = (
            "tum_fr1_xyz: poses, COLMAP: ATE, frames that COLMAP has"),
     Figure(f"Processor time to poses, {_REDKITCHEN}", "baselines",
            "redkitchen: poses, ours: seconds", _COLMAP, "redkitchen: poses, COLMAP: seconds"),
-    Figure("Depth of the room, true poses: kept pixels within 2 %, at 0.88 of completeness", "depth",
+    Figure("Depth of the room, true poses: kept pixels within 2 %, at {kept} of completeness", "depth",
            "room, 320x240: inliers", "plane sweep of OpenCV's parts",
            "room: plane sweep inliers, as complete as filtered"),
-    Figure("Depth of RedKitchen, tracked poses: kept pixels within 5 %, at 0.71 of completeness", "depth",
+    Figure("Depth of RedKitchen, tracked poses: kept pixels within 5 %, at {kept} of completeness", "depth",
            "redkitchen, tracked, 320x240: inliers", "plane sweep of OpenCV's parts",
            "redkitchen, tracked: plane sweep inliers, as complete as filtered"),
     Figure(f"Processor time from frames to map, {_REDKITCHEN}", "baselines",
@@ -86,17 +89,24 @@ def markdown(rows: Rows, first: bool = False) -> str:
     lines = []
     for figure in (figure for figure in FIGURES if figure.first or not first):
         found = {row["name"]: row for row in rows(figure.benchmark)}
-        row, other, *protocol = (found[name] for name in figure.rows)
+        row, other, *shared = (found[name] for name in figure.rows)
         ours, theirs = (pivot.value(one, one["unit"]) for one in (row, other))
         what, baseline = figure.what, figure.baseline
-        if protocol:
-            images = _PROTOCOL.match(protocol[0]["value"])
-            if images is None:
-                raise ValueError(f"{protocol[0]['name']}: {protocol[0]['value']!r} does not say what images both had")
-            what, baseline = (text.format(ours=images[1], theirs=images[2]) for text in (what, baseline))
+        if shared:
+            what, baseline = (text.format(**_words(shared[0])) for text in (what, baseline))
         page = f"[`python -m bench.{figure.benchmark}`](docs/benchmarks/{figure.benchmark}.md)"
         lines.append([what, f"**{ours}**", theirs, baseline, page])
     return pivot.table(["", "ours", "baseline", "which is", "printed by"], lines, numbers=2)
+
+
+def _words(row: dict[str, Any]) -> dict[str, str]:
+    """What a row says of both sides, by the word that stands for it. Raises ValueError where it says nothing."""
+    if isinstance(row["value"], float):
+        return {"kept": f"{row['value']:.2f}"}
+    images = _PROTOCOL.match(row["value"])
+    if images is None:
+        raise ValueError(f"{row['name']}: {row['value']!r} does not say what images both had")
+    return {"ours": images[1], "theirs": images[2]}
 
 
 def plots_of(rows: Rows) -> dict[str, str]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from bench.table import Row, at_least, at_most, main
 from bench.tracking.__main__ import run
-from bench.tracking.cases import CASES, Case, skipped
+from bench.tracking.cases import CASES, Case, missing
 from mvsgs_core.datasets import Item
 from mvsgs_core.stats import Stats
 from nodes.fixed_mask import FixedMask
@@ -74,9 +74,10 @@ def found_in(items: Sequence[Item]) -> list[Item]:
 def tracked(name: str, items: Sequence[Item]) -> tuple[list[Row], float, int]:
     """Rows, the error in cm, and the frames without a pose."""
     result = run(items)
-    error = 100.0 * max(result.frame_errors, default=float("nan"))
+    error = 100.0 * result.worst
     shown = Row(f"{name}: error", error if np.isfinite(error) else None, "cm")
-    return [shown, Row(f"{name}: without a pose", result.unposed, f"of {len(items)}")], error, result.unposed
+    unposed = Row(f"{name}: without a pose", result.unposed, f"of {len(items)}")
+    return [shown, *result.unknown(name), unposed], error, result.unposed
 
 
 def with_drawn(name: str, items: Sequence[Item], draw: Callable[[np.ndarray, float], Drawn]) -> list[Row]:
@@ -106,7 +107,7 @@ def with_drawn(name: str, items: Sequence[Item], draw: Callable[[np.ndarray, flo
 def measure(options: argparse.Namespace) -> list[Row]:
     cv2.setNumThreads(1)
     videos = QUICK if options.quick else VIDEOS
-    rows = skipped(videos)
+    rows = missing(videos)
     for name, case in videos.items():
         if not case.there:
             continue

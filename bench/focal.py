@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 
 from bench.table import Row, at_least, at_most, main
-from bench.tracking.cases import CASES, Case, skipped
+from bench.tracking.cases import CASES, Case, missing
+from bench.tracking.track import track
 from mvsgs_core.datasets import Item
 from mvsgs_core.datasets.lens import guess_lens
-from mvsgs_core.tracking.tracker import Tracker
 
 STREET, HEAD = "kitti_piece", "hololens_000"
 VIDEOS = {
@@ -67,11 +67,8 @@ def parts(name: str, items: Sequence[Item]) -> Iterator[tuple[str, Sequence[Item
 def estimate(name: str, items: Sequence[Item]) -> Estimate:
     height, width = items[0].image.shape[:2]
     guess = np.array(guess_lens((height, width)).intrinsics)
-    tracker = Tracker()
-    for n, item in enumerate(items):
-        tracker.add(n, item.timestamp, item.image, guess, True)
-    for _ in tracker.finish():
-        pass
+    guessed = (replace(i, index=n, intrinsics=guess, intrinsics_guessed=True) for n, i in enumerate(items))
+    tracker = track(guessed).tracker
     truth = float(np.mean(items[0].intrinsics[:2]))
     values = tracker.stats.values
     sigma = values.get("focal_sigma_percent")
@@ -104,13 +101,14 @@ class Given:
 
 def given(name: str, items: Sequence[Item], off: float, zoomed: float = 1.0) -> Given:
     """zoomed: by so much through the frames from the middle one on."""
-    tracker = Tracker()
-    for n, item in enumerate(items):
+
+    def seen(n: int, item: Item) -> Item:
         part = np.clip((n - len(items) / 2) / ZOOMING, 0.0, 1.0)
         image = magnified(item, 1.0 + (zoomed - 1.0) * part) if zoomed != 1.0 else item.image
-        tracker.add(n, item.timestamp, image, item.intrinsics * [1.0 + off, 1.0 + off, 1.0, 1.0])
-    for _ in tracker.finish():
-        pass
+        told = item.intrinsics * [1.0 + off, 1.0 + off, 1.0, 1.0]
+        return replace(item, index=n, image=image, intrinsics=told, intrinsics_guessed=False)
+
+    tracker = track(seen(n, item) for n, item in enumerate(items)).tracker
     values = tracker.stats.values
     found = values.get("focal_checked_px")
     wanted = None if found is None else float(found) / float(items[0].intrinsics[0]) - 1.0
@@ -158,7 +156,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     blamed = sum(one.found is not None for one in exact)
     told = sum(one.found is not None and abs(one.found) < WRONG / 2.0 for one in wrong)
     return [
-        *skipped(videos),
+        *missing(videos),
         *(one.row() for one in found),
         *summary(found),
         *(one.row() for one in known),

@@ -23,20 +23,21 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bench.pieces import Kept
-from bench.runs import folder, folder_name
-from bench.table import Row, all_of, at_least, at_most, main
-from bench.tracking.cases import CASES, Case, skipped
+from bench.aligned import distances
+from bench.live.recordings import write
+from bench.pieces import Kept, kept_arguments
+from bench.runs import folder, folder_name, held_out_scores
+from bench.table import Row, all_of, at_least, at_most, main, names
+from bench.tracking.cases import CASES, Case, missing
+from bench.tracking.track import track
 from launch.compose import compose
 from launch.inline import run_inline
 from msgs import Frame, GroundTruth
-from mvsgs_core import geometry
 from mvsgs_core.datasets import Item
 from mvsgs_core.kept_map import STREAM, tracker_file
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.known_map import KnownMap, load
 from mvsgs_core.tracking.tracker import Tracker
-from nodes.recorder import Recorder
 
 SMALL = [240, 320]  # height, width of the whole runs' frames
 LOOP = {"frames": 300, "loop": True, "threads": 1}
@@ -117,60 +118,65 @@ def scenes(options: argparse.Namespace) -> dict[str, Scene]:
 
 def tracked(items: Sequence[Item], known: KnownMap | None = None, frozen: bool = False) -> tuple[Tracker, int | None]:
     """And the first frame that was found in the map that was known."""
-    tracker, found = Tracker(clock=time.process_time, known=known, frozen=frozen), None
-    for item in items:
-        tracker.add(item.index, item.timestamp, item.image, item.intrinsics, item.intrinsics_guessed)
+    tracker, found = Tracker(clock=time.process_time, known=known, frozen=frozen), list[int]()
+
+    def look(item: Item) -> None:
         pose = tracker.newest_pose()
-        if known is not None and found is None and pose is not None and pose.segment in known.segments:
-            found = item.index
-    for _ in tracker.finish():
-        pass
-    return tracker, found
+        if known is not None and not found and pose is not None and pose.segment in known.segments:
+            found.append(item.index)
+
+    track(items, tracker, look)
+    return tracker, next(iter(found), None)
 
 
-def positions(tracker: Tracker, items: Sequence[Item], before: Sequence[Item]) -> tuple[np.ndarray, np.ndarray, int]:
-    """Of the map's keyframes from `before`, then of the frames of `items`: estimates and truths (N, 3), and how many
-    are the map's. Frames of other parts of the map, and those without a truth, are left out."""
+def positions(tracker: Tracker, first: int = 0) -> dict[int, np.ndarray]:
+    """(3,) by the frame's number in one stream of both halves: keyframes of the map that was known, then the frames of
+    this run that are in its largest part. first: how many frames come before the first of this run."""
     path, graph = tracker.trajectory(), tracker.session.graph
-    old = [k for k in sorted(graph.keyframes) if k < 0 and before[k + STREAM].world_from_cam is not None]
-    new = [int(k) for k in np.flatnonzero(path.main()) if items[int(path.index[k])].world_from_cam is not None]
-    estimates = [graph.world_from_cam(k) for k in old] + [path.world_from_cam[k] for k in new]
-    truths = [before[k + STREAM].world_from_cam for k in old]
-    truths += [items[int(path.index[k])].world_from_cam for k in new]
-    return np.stack(estimates)[:, :3, 3], np.stack([np.asarray(t) for t in truths])[:, :3, 3], len(old)
+    known = {k + STREAM: graph.world_from_cam(k)[:3, 3] for k in sorted(graph.keyframes) if k < 0}
+    return known | {first + int(path.index[k]): path.world_from_cam[k, :3, 3] for k in np.flatnonzero(path.main())}
 
 
-def errors(estimates: np.ndarray, truths: np.ndarray, aligned_by: slice) -> np.ndarray:
-    """(N,) distances, aligned by some of them."""
-    s, r, t = geometry.umeyama(estimates[aligned_by], truths[aligned_by])
-    return np.asarray(np.linalg.norm(s * estimates @ r.T + t - truths, axis=1))
+def errors(
+    found: dict[int, np.ndarray], truths: dict[int, np.ndarray], chosen: Sequence[int], by: Sequence[int]
+) -> np.ndarray:
+    """(N,) distances of the chosen frames from the truth, after alignment by others."""
+    together = [*by, *chosen]
+    estimates, wanted = (np.stack([known[k] for k in together]) for known in (found, truths))
+    return distances(estimates, wanted, slice(len(by)))[len(by) :]
+
+
+def compared(
+    extended: dict[int, np.ndarray], one: dict[int, np.ndarray], truths: dict[int, np.ndarray], first: int
+) -> tuple[float, float]:
+    """Median errors of the second half on the known map and in one run over both: of the same frames, after alignment
+    by the same ones, which are all that both have and whose truth is known."""
+    common = sorted(extended.keys() & one.keys() & truths.keys())
+    second = [k for k in common if k >= first]
+    on_map, alone = (float(np.median(errors(found, truths, second, common))) for found in (extended, one))
+    return on_map, alone
 
 
 def rows_of_tracking(name: str, way: Return, file: Path) -> list[Row]:
     """file: the first half's map."""
-    everything, known = slice(None), load(file)
+    known, first, count = load(file), len(way.first), len(way.second)
+    truths = {item.index: item.world_from_cam[:3, 3] for item in way.both if item.world_from_cam is not None}
     tracker, found = tracked(way.second, known.renumbered(STREAM))
-    estimates, truths, old = positions(tracker, way.second, way.first)
-    together = 100.0 * float(np.median(errors(estimates, truths, everything)[old:]))
-    one = tracked(way.both)[0]
-    estimates, truths, _ = positions(one, way.both, ())
-    second = one.trajectory().index[one.trajectory().main()] >= len(way.first)
-    second = second[[way.both[k].world_from_cam is not None for k in one.trajectory().index[one.trajectory().main()]]]
-    alone = 100.0 * float(np.median(errors(estimates, truths, everything)[second]))
+    on_map, alone = compared(positions(tracker, first), positions(tracked(way.both)[0]), truths, first)
     frozen, _ = tracked(way.second, known.renumbered(STREAM), frozen=True)
-    estimates, truths, old = positions(frozen, way.second, way.first)
-    off = 100.0 * errors(estimates, truths, slice(old))[old:]
+    there = positions(frozen, first)
+    old, new = ([k for k in there if k in truths and (k >= first) == late] for late in (False, True))
+    off = 100.0 * float(np.median(errors(there, truths, new, old)))
     path, posed = tracker.trajectory(), int(frozen.trajectory().posed.sum())
-    count = len(way.second)
     seconds = np.inf if found is None else found * way.step
     cost = 1e3 * tracker.stats.seconds["taking up the map"]
     return [
         at_most(f"{name}: the camera is found after", seconds, "s of video", 1.0),
         all_of(f"{name}: frames posed in the map's frame of reference", int(path.main().sum()), count),
-        Row(f"{name}: error of one run over both, second half, median", alone, "cm"),
-        at_most(f"{name}: error on the map, over that", together / alone, "", 1.5),
+        Row(f"{name}: error of one run over both, second half, median", 100.0 * alone, "cm"),
+        at_most(f"{name}: error on the map, over that", on_map / alone, "", 1.5),
         Row(f"{name}: frozen: frames found", f"{posed} of {count}"),
-        Row(f"{name}: frozen: error in the first half's frame, median", float(np.median(off)), "cm"),
+        Row(f"{name}: frozen: error in the first half's frame, median", off, "cm"),
         Row(f"{name}: the tracker's half, {len(known.keyframes)} keyframes", 1e-6 * file.stat().st_size, "MB"),
         Row(f"{name}: taking it up", cost, "ms CPU"),
     ]
@@ -206,16 +212,11 @@ EACH = (
 QUICKLY = ("mapper.iterations=8",)
 
 
-def recorded(items: Sequence[Item], file: Path) -> Path:
+def messages(items: Sequence[Item]) -> Iterator[Frame | GroundTruth]:
     """A stream of them for whole runs."""
-    aside = file.with_suffix(".part")
-    aside.unlink(missing_ok=True)
-    recorder = Recorder(Recorder.Config(path=str(aside), foxglove=False))
     for i in items:
-        recorder.on_message(Frame(i.index, i.timestamp, i.image, i.intrinsics, i.intrinsics_guessed, i.exposure))
-        recorder.on_message(GroundTruth(i.index, i.timestamp, i.image, i.intrinsics, i.world_from_cam, i.depth))
-    list(recorder.on_end())
-    return aside.rename(file)
+        yield Frame(i.index, i.timestamp, i.image, i.intrinsics, i.intrinsics_guessed, i.exposure)
+        yield GroundTruth(i.index, i.timestamp, i.image, i.intrinsics, i.world_from_cam, i.depth)
 
 
 def held_out(words: Sequence[str], items: Sequence[Item], output: Path, first: int, kept: Kept) -> dict[int, float]:
@@ -225,14 +226,13 @@ def held_out(words: Sequence[str], items: Sequence[Item], output: Path, first: i
     asked = {"overrides": given, "images": identity(items)}
     if not kept.has(file, asked):
         shutil.rmtree(output, ignore_errors=True)
-        stream = recorded(items, output.with_suffix(".mcap"))
+        stream = write(messages(items), output.with_suffix(".mcap"))
         run_inline(compose([*given, f"dataset.path={stream}", f"output={output}"]))
         if not json.loads(file.read_text()).get("finished", True):
             raise RuntimeError(f"the run in {output} ended early: see its report.json")
         kept.keep(file, asked)
     report: dict[str, Any] = json.loads(file.read_text())
-    frames = report["rendering"]["frames"]
-    return {frame["index"] - first: frame["psnr"] for frame in frames if frame["held_out"] and frame["index"] >= first}
+    return {index - first: psnr for index, psnr in held_out_scores(report).items() if index >= first}
 
 
 def rows_of_map(name: str, way: Return, first: Path, place: Path, options: argparse.Namespace, kept: Kept) -> list[Row]:
@@ -263,10 +263,8 @@ def identity(items: Sequence[Item]) -> str:
 def mapped(options: argparse.Namespace) -> dict[str, Scene]:
     """Those of which there are whole runs."""
     there = scenes(options)
-    wanted = list(there) if options.maps is None else options.maps.split(";")
-    if unknown := sorted(set(wanted) - there.keys()):
-        raise SystemExit(f"no scene {'; '.join(unknown)} here; there are: {'; '.join(there)}")
-    return {name: there[name] for name in wanted} if options.part != "tracker" else {}
+    wanted = options.maps or list(there)
+    return {name: there[name] for name in wanted if name in there} if options.part != "tracker" else {}
 
 
 def parts(options: argparse.Namespace, place: Path) -> Iterator[list[Row]]:
@@ -289,7 +287,7 @@ def parts(options: argparse.Namespace, place: Path) -> Iterator[list[Row]]:
             runs = place / folder_name(name)
             runs.mkdir(exist_ok=True)
             yield rows_of_map(name, way, place / f"{folder_name(scene)}-first", runs, options, kept)
-    yield [] if options.quick else skipped({name: scene.plain for name, scene in SCENES.items()})
+    yield [] if options.quick else missing({name: scene.plain for name, scene in SCENES.items()})
     yield kept.origin()
 
 
@@ -300,9 +298,9 @@ def measure(options: argparse.Namespace) -> list[Row]:
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--part", choices=("all", "tracker"), default="all", help="tracker: no whole runs")
-    parser.add_argument("--maps", help="scenes of which there are whole runs, separated by semicolons; default: all")
-    parser.add_argument("--resume", action="store_true", help="what the same command left there is not measured again")
-    parser.add_argument("--output", type=Path, help="folder of the runs; default: runs/bench/known_map")
+    told = f"scenes of which there are whole runs, separated by semicolons, of {'; '.join(SCENES)}; default: all"
+    parser.add_argument("--maps", type=names(SCENES, ";"), help=told)
+    kept_arguments(parser)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
 """A large map: the tracker's time and memory a keyframe as a map grows to thousands, and its error after loops.
 
-Two measurements. `driven`: the tracker along the streets of a synthetic town, whose frames another process renders, so
-that the process's memory is the tracker's own. `enlarged`: two trackers on the same
-frames, one of which is given copies of its own keyframes far away until its map has thousands: what a keyframe costs
-in a large map over what it costs in a small one, in turns, frame by frame. So the growth is measured in minutes.
+Two measurements, each in a process of its own. `driven`: the tracker along the streets of a synthetic town, which a
+further process renders, so that the process's memory is the tracker's own. `enlarged`: two trackers on the same frames,
+one of which is given copies of its own keyframes far away until its map has thousands: what a keyframe costs in a large
+map over what it costs in a small one, in turns, frame by frame. So the growth is measured in minutes.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import argparse
 import multiprocessing
 import resource
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 
@@ -20,8 +21,8 @@ import cv2
 import numpy as np
 import psutil
 
+from bench.aligned import aligned_error
 from bench.table import Row, at_least, at_most, main
-from bench.tracking.baselines import aligned_error
 from mvsgs_core.datasets import Item
 from mvsgs_core.datasets.synthetic import Synthetic
 from mvsgs_core.tracking.graph import Edge, Keyframe
@@ -100,7 +101,7 @@ def driven(frames: int) -> list[Row]:
     start, there = time.process_time(), memory()
     for _ in tracker.finish():
         pass
-    finishing, peak = time.process_time() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    finishing, peak = time.process_time() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
     path = np.array(truths)
     found = tracker.trajectory()
     main_part = found.main()
@@ -184,7 +185,7 @@ def enlarged(frames: int, begin: int, total: int) -> list[Row]:
     rows = [
         Row("enlarged: keyframes in the small map", len(trackers[0].session.graph.keyframes)),
         Row("enlarged: keyframes in the large one", len(trackers[1].session.graph.keyframes)),
-        Row("enlarged: the same poses", str(np.array_equal(poses[0], poses[1]))),
+        alike(*poses),
         Row("enlarged: time a keyframe in the small map", 1e3 * small / len(costs[0].seconds), "ms"),
         at_most("enlarged: large over small", large / small, "", GROWTH),
         Row("enlarged: memory that a keyframe adds", added, "kB"),
@@ -197,19 +198,27 @@ def enlarged(frames: int, begin: int, total: int) -> list[Row]:
     return rows
 
 
+def alike(small: np.ndarray, large: np.ndarray) -> Row:
+    """Whether the poses (N, 4, 4) of both trackers are: what a large map has besides must not change them."""
+    same = np.array_equal(small, large)
+    return Row("enlarged: the same poses", str(same), "", "True", same)
+
+
 def _newest(tracker: Tracker, begin: int) -> list[int]:
     return [index for index in sorted(tracker.session.graph.keyframes) if index >= begin]
 
 
+def alone(measured: Callable[..., list[Row]], *given: int) -> list[Row]:
+    """The rows of a measurement in a process of its own, whose most memory is then that of this measurement alone."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), cv2.setNumThreads, (1,)) as process:
+        return process.submit(measured, *given).result()
+
+
 def measure(options: argparse.Namespace) -> list[Row]:
-    cv2.setNumThreads(1)
     frames = options.frames or (500 if options.quick else 6000)
     total = options.keyframes or (1000 if options.quick else LARGE)
-    if options.only == "enlarged":
-        return enlarged(400, 250, total)
-    if options.only == "driven":
-        return driven(frames)
-    return [*enlarged(400, 250, total), *driven(frames)]
+    rows = [] if options.only == "driven" else alone(enlarged, 400, 250, total)
+    return rows if options.only == "enlarged" else [*rows, *alone(driven, frames)]
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -22,9 +22,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bench.known_map import errors, tracked
+from bench.aligned import distances
 from bench.table import Row, all_of, at_least, at_most, main, names
-from bench.tracking.cases import CASES, Case, skipped
+from bench.tracking.cases import CASES, Case, missing
+from bench.tracking.track import track
 from launch.compose import compose
 from launch.inline import run_inline
 from launch.ports import free_ports
@@ -221,7 +222,7 @@ def medians(items: Sequence[Item], seen: Seen, shown: Sequence[Piece]) -> tuple[
     truths = np.stack([unknown if i.world_from_cam is None else i.world_from_cam for i in items])[:, :3, 3]
     order = np.array([item.index for piece in shown for item in piece.items])
     after = of_returns(shown)[0].start
-    alone = by_frame(tracked(items)[0].trajectory(), truths)
+    alone = by_frame(track(items).tracker.trajectory(), truths)
     here = by_frame(seen.trajectory, truths[order])
     return (
         100.0 * float(np.median([alone[n] for n in order[after:] if n in alone])),
@@ -232,9 +233,24 @@ def medians(items: Sequence[Item], seen: Seen, shown: Sequence[Piece]) -> tuple[
 def by_frame(path: CameraTrajectory, truths: np.ndarray) -> dict[int, float]:
     """Distances from the truths (N, 3), of the frames of the map that have one, aligned by all of these."""
     there = np.flatnonzero(path.main() & np.isfinite(truths).all(axis=1))
-    return dict(
-        zip(there.tolist(), errors(path.world_from_cam[there, :3, 3], truths[there], slice(None)).tolist(), strict=True)
-    )
+    return dict(zip(there.tolist(), distances(path.world_from_cam[there, :3, 3], truths[there]).tolist(), strict=True))
+
+
+def rows_of_returns(name: str, seen: Seen, returns: Sequence[range], interval: float) -> list[Row]:
+    """interval: seconds of the sequence between frames."""
+    main_part = seen.trajectory.main()
+    there = [frames for frames in returns if main_part[frames.start : frames.stop].any()]
+    found = [found_after(seen, frames) for frames in there]
+    at_once = [frames for frames in found if frames is not None]
+    later = [joined_after(seen, frames) for frames, when in zip(there, found, strict=True) if when is None]
+    joined = [frames for frames in later if frames is not None]
+    return [
+        all_of(f"{name}: returns that are part of the map in the end", len(there), len(returns)),
+        Row(f"{name}: of these relocalized as they came", len(at_once)),
+        at_most(f"{name}: relocalized after, worst", max(at_once, default=np.inf) * interval, "s of video", 1.0),
+        Row(f"{name}: parts that joined later", len(joined)),
+        Row(f"{name}: joined after, worst", max(joined, default=0) * interval, "s of video"),
+    ]
 
 
 def rows_of(name: str, case: Case, away: Sequence[float]) -> list[Row]:
@@ -242,12 +258,8 @@ def rows_of(name: str, case: Case, away: Sequence[float]) -> list[Row]:
     shown, interval = pieces(items, away), step(items)
     program, seen, counts = run(shown, interval)
     returns = of_returns(shown)
-    at_once = [found for frames in returns if (found := found_after(seen, frames)) is not None]
-    later = [joined_after(seen, frames) for frames in returns if found_after(seen, frames) is None]
-    joined = [frames for frames in later if frames is not None]
     main_part = seen.trajectory.main()
     after = returns[0].start
-    posed = [int(main_part[frames.start : frames.stop].any()) for frames in returns]
     alone, error = medians(items, seen, shown)
     refused = sum(program.sent[what] for what in REFUSALS)
     return [
@@ -257,11 +269,7 @@ def rows_of(name: str, case: Case, away: Sequence[float]) -> list[Row]:
             f"{name}: what is no new frame, refused", int(sum(counts.get(c, 0) for c in REFUSALS.values())), refused
         ),
         Row(f"{name}: from the camera's return to its first frame, worst", max(program.back), "s"),
-        all_of(f"{name}: returns that are part of the map in the end", sum(posed), len(returns)),
-        Row(f"{name}: of these relocalized as they came", len(at_once)),
-        at_most(f"{name}: relocalized after, worst", max(at_once, default=0) * interval, "s of video", 1.0),
-        Row(f"{name}: parts that joined later", len(joined)),
-        Row(f"{name}: joined after, worst", max(joined, default=0) * interval, "s of video"),
+        *rows_of_returns(name, seen, returns, interval),
         at_least(
             f"{name}: frames after returns with a pose in the map, in the end",
             100.0 * float(main_part[after:].mean()),
@@ -288,7 +296,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
         return [row for name, case in QUICK.items() for row in rows_of(name, case, QUICK_AWAY)]
     wanted = SCENES if options.scenes is None else {name: SCENES[name] for name in options.scenes}
     there = {name: case for name, case in wanted.items() if case.there}
-    return [row for name, case in there.items() for row in rows_of(name, case, AWAY)] + skipped(wanted)
+    return [row for name, case in there.items() for row in rows_of(name, case, AWAY)] + missing(wanted)
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from bench.runs import DATA
-from bench.table import Row, at_least, at_most, main
+from bench.table import Row, at_least, at_most, main, skipped
 from mvsgs_core.datasets import Item, open_dataset
 from mvsgs_core.fusion.normals import normals_of
 from mvsgs_core.image_metrics import psnr
@@ -231,7 +231,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     if options.real.exists():
         rows += singly(kitchen(options.real, 6 * options.ablation_keyframes, size), config)
     else:
-        rows.append(Row(f"kitchen: {options.real} is missing, left out", None))
+        rows.append(skipped("kitchen", options.real))
     return rows
 
 

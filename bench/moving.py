@@ -16,7 +16,7 @@ import numpy as np
 
 from bench.fixed_parts import AGREES, TIMES, tracked
 from bench.table import Row, at_most, main
-from bench.tracking.cases import CASES, Case, skipped
+from bench.tracking.cases import CASES, Case, missing
 from mvsgs_core.datasets import Item
 
 VIDEOS = {name: CASES[name] for name in ("redkitchen", "tum_fr1_xyz", "room")}
@@ -64,7 +64,7 @@ def with_person(items: Sequence[Item], share: float, period: int) -> tuple[list[
 def measure(options: argparse.Namespace) -> list[Row]:
     cv2.setNumThreads(1)
     videos = QUICK if options.quick else VIDEOS
-    rows, errors, ideals = skipped(videos), list[float](), list[float]()
+    rows, errors, ideals = missing(videos), list[float](), list[float]()
     widths, periods = ((0.35,), (60,)) if options.quick else (WIDTHS, PERIODS)
     for name, case in videos.items():
         if not case.there:

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from bench.runs import environment
-from bench.table import Row, main
+from bench.table import Row, main, skipped
 from mvsgs_core import weights
 from mvsgs_core.droid.networks import random_net
 from mvsgs_core.evaluation.lpips import Lpips
@@ -110,7 +110,7 @@ CASES: dict[str, Callable[[int, int, str], Case]] = {
 
 def _peak() -> float:
     """MB of this process so far."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6  # which is in KiB
 
 
 @torch.no_grad()
@@ -156,7 +156,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
         done = subprocess.run(command, capture_output=True, text=True, check=True)
         figures = json.loads(done.stdout.splitlines()[-1])
         if "missing" in figures:
-            rows.append(Row(name, "not measured", figures["missing"]))
+            rows.append(skipped(name, figures["missing"]))
         rows += [Row(f"{name}: {what}", figures[key], unit) for key, what, unit in _UNITS if figures.get(key)]
     return rows
 

@@ -15,6 +15,7 @@ import argparse
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,22 +26,20 @@ from bench.baselines.offline import Trained
 from bench.baselines.ours import Ours, run_ours, why_not
 from bench.runs import QUICK, choices, figure, folder
 from bench.table import Row, at_least, failed, main, names
-from bench.wide import in_pieces
 
 SCENES = ("fountain", "kitti_piece", "drone_tractor_orbit", "south_building")
 GIVEN = ("tracker=photographs", "evaluator.fitted=false")
 BEHIND = -1.0  # dB that ours may be behind
 COVERED = 97.0  # % of the held-out photographs' pixels
-WAYS = {"exposure": ("none", "trained"), "rates": tuple(offline.RATES)}  # of which theirs is the best
+# of which theirs is the best; on all photographs that are not held out, whether or not ours has a pose of them
+WAYS: dict[str, tuple[Any, ...]] = {"frames": ("all",), "exposure": ("none", "trained"), "rates": tuple(offline.RATES)}
 
 
 def colmap(ours: Ours, place: Path, resume: bool) -> tuple[Model | None, str]:
     """COLMAP's model of all photographs, at the size of our run; with resume one of the same images is taken again."""
-    if not resume:
-        colmap_poses.forget(place)
     frames = {index: frame.image for index, frame in ours.frames.items()}
     intrinsics = next(iter(ours.frames.values())).intrinsics
-    return colmap_poses.reconstruct_once(frames, intrinsics, place, 1, photographs=True)
+    return colmap_poses.reconstruct_once(frames, intrinsics, place, 1, pieces.Kept(resume), photographs=True)
 
 
 def with_focal(ours: Ours, focal: float) -> Ours:
@@ -85,6 +84,10 @@ def protocol(scene: str, ours: Ours) -> Row:
     return Row(f"{scene}: protocol", f"{len(ours.frames)} at {width}x{height}, {len(ours.held_out)} held out, {made}")
 
 
+def ways(options: argparse.Namespace) -> dict[str, tuple[Any, ...]]:
+    return {part: values[:1] for part, values in WAYS.items()} if options.quick else WAYS
+
+
 def overrides_of(options: argparse.Namespace) -> list[str]:
     return [*GIVEN, *options.overrides, *(QUICK if options.quick else ())]
 
@@ -104,26 +107,23 @@ def compare(scene: str, options: argparse.Namespace, output: Path) -> list[Row]:
         kept.unlink(missing_ok=True)
     theirs = with_focal(ours, model.focal)
     train = offline.kept_in(kept, lambda way, seconds: offline.train(model, theirs, way, seconds, 1))
-    parts = {"exposure": ("none",)} if options.quick else WAYS
-    _, tried = offline.best_way(parts, train, ours.optimization)
+    _, tried = offline.best_way(ways(options), train, ours.optimization)
     best = max(tried, key=lambda result: result.psnr)
     return [*rows, *our_rows(scene, ours, set(model.index.tolist())), *their_rows(scene, ours, model, best)]
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
     scenes, skipped = pieces.with_data(options.scenes or (SCENES[:1] if options.quick else SCENES))
-    output, asked = folder(options, "photographs"), {"overrides": overrides_of(options), "quick": options.quick}
+    output, asked = folder(options, "photographs"), {"overrides": overrides_of(options), "ways": ways(options)}
     measured = partial(compare, options=options, output=output)
-    return in_pieces(scenes, output, options.resume, options.minutes, measured, asked) + skipped
+    return pieces.in_pieces(scenes, output, options.resume, options.minutes, measured, asked) + skipped
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     told = f"comma separated; default: {','.join(SCENES)}; --quick: {SCENES[0]}"
     parser.add_argument("--scenes", type=names(choices("scene")), help=told)
     parser.add_argument("overrides", nargs="*", help="of our runs: dataset.size=60000")
-    parser.add_argument("--output", type=Path, help="folder of what was measured; default: in runs")
-    parser.add_argument("--resume", action="store_true", help="keep what an earlier call measured")
-    parser.add_argument("--minutes", type=float, help="begin no scene after; --resume goes on")
+    pieces.kept_arguments(parser, minutes=True)
 
 
 if __name__ == "__main__":

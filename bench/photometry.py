@@ -9,16 +9,15 @@ a pair's log ratio of gray levels is left.
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Mapping
 from typing import Any
 
 import cv2
 import numpy as np
 
-from bench.table import Row, at_most, main
+from bench.table import Row, at_most, main, skipped
 from bench.tracking.cases import CASES, Case
-from mvsgs_core.datasets import Item
+from bench.tracking.track import track
 from mvsgs_core.scene.difficulties import Difficulties, Sensor
 from mvsgs_core.tracking.estimation.photometry import PhotometricEdges, solve_photometry
 from mvsgs_core.tracking.estimation.response import MIDDLE
@@ -43,15 +42,6 @@ VIDEOS = {
     "hololens_000": Case("tum", {"size": (180, 270)}, "hololens_000"),
     "kitti_piece": Case("tum", {"size": (185, 613)}, "kitti_piece"),
 }
-
-
-def tracked(items: list[Item]) -> Tracker:
-    tracker = Tracker(clock=time.process_time)
-    for item in items:
-        tracker.add(item.index, item.timestamp, item.image, item.intrinsics, item.intrinsics_guessed)
-    for _ in tracker.finish():
-        pass
-    return tracker
 
 
 def level_errors(tracker: Tracker, sensor: Sensor, keyframes: bool) -> float:
@@ -100,7 +90,7 @@ def response_error(tracker: Tracker, sensor: Sensor, offset: float) -> float:
 
 
 def rows_of_varying(name: str, options: Mapping[str, Any], frames: int) -> list[Row]:
-    tracker = tracked(Case("synthetic", {"frames": frames, "threads": 1, **options}).items())
+    tracker = track(Case("synthetic", {"frames": frames, "threads": 1, **options}).items()).tracker
     sensor = Sensor(Difficulties(**options), 0)
     rows = [
         at_most(f"room, {name}: gray levels of keyframes", level_errors(tracker, sensor, True), "%", 1.0),
@@ -117,7 +107,7 @@ def rows_of_varying(name: str, options: Mapping[str, Any], frames: int) -> list[
 
 
 def rows_of_steady(name: str, options: Mapping[str, Any]) -> list[Row]:
-    tracker = tracked(Case("synthetic", {"frames": 120, "threads": 1, **options}).items())
+    tracker = track(Case("synthetic", {"frames": 120, "threads": 1, **options}).items()).tracker
     exposure = tracker.trajectory().exposure
     span = 0.0 if exposure is None else 100.0 * float(np.ptp(np.log(exposure[:, 1, :3].sum(axis=1))))
     return [
@@ -130,8 +120,8 @@ def rows_of_video(name: str, case: Case) -> list[Row]:
     try:
         items = case.items()
     except FileNotFoundError as error:
-        return [Row(f"{name}: skipped", str(error))]
-    tracker = tracked(items)
+        return [skipped(name, str(error))]
+    tracker = track(items).tracker
     photometer = tracker.session.photometer
     found = photometer.photometry
     gains = 100.0 * (np.exp(np.ptp(found.gains)) - 1.0) if found.varies else 0.0

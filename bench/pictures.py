@@ -19,6 +19,7 @@ import numpy as np
 from bench.before import SCENES, place
 from bench.finished import FinishedRun, frames_of
 from bench.runs import ROOT
+from bench.table import names
 from mvsgs_core.camera import resize_image
 from mvsgs_core.evaluation.scoring import colorize, colorize_depth
 
@@ -105,11 +106,12 @@ def draw(folder: Path, scene: str, seed: int, file: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--scenes", default="redkitchen,tum_fr1_xyz,icl_nuim,room", help=f"of {', '.join(SCENES)}")
+    default = ["redkitchen", "tum_fr1_xyz", "icl_nuim", "room"]
+    parser.add_argument("--scenes", type=names(SCENES), default=default, help=f"of {', '.join(SCENES)}")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--to", type=Path, default=ROOT / "docs" / "benchmarks", help="folder of the pictures")
     given = parser.parse_args()
-    for name in given.scenes.split(","):
+    for name in given.scenes:
         target = given.to / f"before_{name}.jpg"
         draw(given.folder, name, given.seed, target)
         print(target)

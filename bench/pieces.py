@@ -12,11 +12,12 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from bench.runs import ROOT, Matrix, Run, commit, missing_data
-from bench.table import Row, is_failure
+from bench.table import Row, is_failure, skipped
 from mvsgs_core.atomic_file import replace_text
 
 
@@ -136,8 +137,30 @@ def _asked_file(file: Path) -> Path:
 def with_data(scenes: Sequence[str]) -> tuple[list[str], list[Row]]:
     """The scenes whose data are on this machine, and a row for each that is left out."""
     missing = {scene: path for scene in scenes if (path := missing_data(scene)) is not None}
-    rows = [Row(f"{scene}: skipped", f"{path} is missing") for scene, path in missing.items()]
+    rows = [skipped(scene, path) for scene, path in missing.items()]
     return [scene for scene in scenes if scene not in missing], rows
+
+
+def in_pieces(
+    scenes: Sequence[str], output: Path, resume: bool, minutes: float | None, measured: Callable[[str], list[Row]],
+    asked: Any,
+) -> list[Row]:  # fmt: skip
+    """The rows of all scenes, of which those of another time are read where `resume`; each is kept as it ends.
+
+    minutes: no scene is begun after; None: all are. asked: what else the rows of a scene depend on.
+    """
+    start, rows, kept, left = time.monotonic(), list[Row](), Kept(resume), list[str]()
+    for name in scenes:
+        file = output / f"{name}.json"
+        late = minutes is not None and time.monotonic() - start > 60.0 * minutes
+        if late and not kept.has(file, asked):
+            left.append(name)
+        else:
+            rows += kept.rows(file, asked, partial(measured, name))
+    rows += kept.origin()
+    if left:
+        rows.append(Row("not measured yet (--resume goes on with them)", ", ".join(left)))
+    return rows
 
 
 def arguments(parser: argparse.ArgumentParser, example: str, jobs: bool = False) -> None:
@@ -145,10 +168,16 @@ def arguments(parser: argparse.ArgumentParser, example: str, jobs: bool = False)
     if jobs:
         parser.add_argument("--jobs", type=int, default=1, help="runs at once; times mean little above 1")
     parser.add_argument("overrides", nargs="*", help=f"of every run: {example}")
-    parser.add_argument("--output", type=Path, help="folder of the runs; default: in runs")
-    parser.add_argument("--resume", action="store_true", help="keep the runs of an earlier call that it finished")
-    parser.add_argument("--minutes", type=float, help="start no more runs after; --resume goes on")
+    kept_arguments(parser, minutes=True)
     parser.add_argument("--collect", action="store_true", help="only read the runs that are in the folder")
+
+
+def kept_arguments(parser: argparse.ArgumentParser, minutes: bool = False) -> None:
+    """What the command line of a benchmark has that keeps what it measured. minutes: it can be told when to end."""
+    parser.add_argument("--output", type=Path, help="folder of what is measured; default: in runs")
+    parser.add_argument("--resume", action="store_true", help="keep what an earlier call of the same finished")
+    if minutes:
+        parser.add_argument("--minutes", type=float, help="start nothing more after; --resume goes on")
 
 
 def asked(matrix: Matrix) -> dict[str, Any]:

@@ -39,7 +39,7 @@ from mvsgs_core.rasterizer.kernels import KERNELS
 from mvsgs_core.rasterizer.rasterize import RenderSettings, rasterize
 from mvsgs_core.rasterizer.splats import Splats
 
-PASSES = 3  # of the kernel in a round
+PASSES = 3  # of the kernel in a round, with one thread as with several
 SPEEDUP = 4.0  # over the plain loops
 ROOFLINE = 35.0  # %
 FORWARD_VECTORS, BACKWARD_VECTORS = 10, 10  # 64-byte loads and stores of a tile's state per block and splat
@@ -227,12 +227,12 @@ def compare(size: tuple[int, int], count: int, threads: int, rounds: int) -> lis
         done = work(splats, size, kernel)
         measured = [Round() for _ in range(rounds)]
         for each in measured:
-            for i in range(PASSES):
+            for _ in range(PASSES):  # with one thread in turns, so that both find the caches as the other left them
                 image = run(splats, size, kernel, "cpu", threads, each.fast)
-                if kernel != "ges_scale" and i == 0:
-                    other = run_baseline(splats, size, kernel, threads, each.plain)
+                if kernel != "ges_scale":
                     run(splats, size, kernel, "cpu", 1, each.one)
             if kernel != "ges_scale":
+                other = run_baseline(splats, size, kernel, threads, each.plain)
                 each.bound = roofline(done, count, size, kernel, threads)
                 each.alone = roofline(done, count, size, kernel, 1)
         both = [each.fast.total() for each in measured]

@@ -27,8 +27,9 @@ from pathlib import Path
 from typing import Any
 
 from bench import figures, pivot, plots
-from bench.runs import ROOT, commit, machine
-from bench.table import origin_of
+from bench.runs import ROOT, commit
+from bench.table import is_skipped, origin_of
+from mvsgs_core.machine import processor
 
 RECORDED = ROOT / "bench" / "recorded"
 PAGES = ROOT / "docs" / "benchmarks"
@@ -154,7 +155,7 @@ def origin(files: Iterable[Path]) -> tuple[dict[str, str], list[Path]]:
             found.append(json.loads(beside.read_text()))
         else:
             silent.append(file)
-            found.append({"commit": commit(), "machine": machine(), "date": time.strftime("%Y-%m-%d")})
+            found.append({"commit": commit(), "machine": processor(), "date": time.strftime("%Y-%m-%d")})
     return {key: ", ".join(dict.fromkeys(one[key] for one in found)) for key in found[0]}, silent
 
 
@@ -208,7 +209,7 @@ def run(arguments: list[str]) -> int:
             parser.error(f"{options.name}: which files?")
         stem, quick = options.name.rpartition("/")[2], options.name.startswith("quick/")
         try:
-            if all(": skipped" in row["name"] for rows in read_rows(options.files) for row in rows):
+            if all(is_skipped(row["name"]) for rows in read_rows(options.files) for row in rows):
                 print(f"{options.name} measured nothing here: its record stays as it is")
                 return 0
             command = options.command or f"python -m bench.{stem}" + (" --quick" if quick else "")

@@ -18,7 +18,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from mvsgs_core.machine import processor
+from mvsgs_core.evaluation import metrics
 
 ROOT = Path(__file__).resolve().parent.parent
 CONF = ROOT / "bench" / "conf"
@@ -112,7 +112,7 @@ class Matrix:
             raise ValueError(f"{self.checkout} is no checkout of this project: it has no launch/run_all.py")
 
     def command(self, output: Path) -> list[str]:
-        launcher = ["hydra/launcher=joblib", f"hydra.launcher.n_jobs={self.jobs}"] if self.jobs > 1 else []
+        parallel = ["hydra/launcher=joblib", f"hydra.launcher.n_jobs={self.jobs}"] if self.jobs > 1 else []
         conf = self.checkout / "bench" / "conf"
         search = [f"file://{folder}" for folder in dict.fromkeys((conf, CONF)) if folder.is_dir()]
         settings = []
@@ -121,11 +121,10 @@ class Matrix:
             settings = [f"+setting={','.join(setting.name for setting in self.settings)}"]
         return [
             *self.prefix,
-            python(self.checkout),
-            str(self.checkout / "launch" / "run_all.py"),
+            *launcher(self.checkout),
             "-m",
             f"hydra.searchpath=[{','.join(search)}]",
-            *launcher,
+            *parallel,
             f"+scene={','.join(self.scenes)}",
             f"+variant={','.join(self.variants)}",
             *settings,
@@ -189,11 +188,15 @@ def python(checkout: Path = ROOT) -> str:
     return str(own) if checkout != ROOT and own.exists() else sys.executable
 
 
+def launcher(checkout: Path = ROOT) -> list[str]:
+    """The command that starts a run of a checkout, without its arguments."""
+    return [python(checkout), str(checkout / "launch" / "run_all.py")]
+
+
 def launch(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
     """One run of the launcher, to its end; its screen is in the result. Raises CalledProcessError where it fails."""
-    command = [sys.executable, str(ROOT / "launch" / "run_all.py"), *arguments]
     given = {"check": True, "cwd": ROOT, "env": environment(), **options}
-    return subprocess.run(command, capture_output=True, text=True, **given)
+    return subprocess.run([*launcher(), *arguments], capture_output=True, text=True, **given)
 
 
 def environment() -> dict[str, str]:
@@ -232,10 +235,13 @@ def folder_name(text: str) -> str:
 
 def figure(report: dict[str, Any] | None, path: str) -> float | None:
     """A number of a report by its path, such as "rendering.held_out.psnr"; None where there is none."""
-    value: Any = report
-    for key in path.split("."):
-        value = value.get(key) if isinstance(value, dict) else None
-    return float(value) if isinstance(value, int | float) else None
+    return metrics.number(report or {}, path)
+
+
+def held_out_scores(report: dict[str, Any] | None, part: str = "rendering") -> dict[int, float]:
+    """PSNR, dB, of the held-out frames that have one, by frame. part: of the report."""
+    frames = ((report or {}).get(part) or {}).get("frames", ())
+    return {frame["index"]: frame["psnr"] for frame in frames if frame["held_out"] and frame["psnr"] is not None}
 
 
 def stage_seconds(report: dict[str, Any] | None, node: str) -> float:
@@ -258,11 +264,6 @@ def said(run: Run) -> str:
         return (own or refused or ["no report"])[-1]
     warned = [f"{node}: {text}" for node, texts in run.report.get("warnings", {}).items() for text in texts]
     return "; ".join(warned) or "nothing"
-
-
-def machine() -> str:
-    """This machine in one line, for the record."""
-    return processor()
 
 
 def commit(checkout: Path = ROOT) -> str:

@@ -19,10 +19,12 @@ from typing import TypeVar
 from rich.console import Console
 from rich.table import Table
 
-from bench.runs import commit, machine
+from bench.runs import commit
+from mvsgs_core.machine import processor
 
 T = TypeVar("T")
 REPORT = "a report"  # goal of a run: without one there is nothing to measure
+SKIPPED = ": skipped"  # how the name of a row ends that says what is left out
 
 
 @dataclass(frozen=True)
@@ -38,11 +40,13 @@ class Row:
 
 
 def at_most(name: str, value: float, unit: str, limit: float) -> Row:
-    return Row(name, value, unit, f"<= {limit:g}", bool(value <= limit))
+    """No value meets a limit that is not finite, as of a run that failed; NaN meets none."""
+    return Row(name, value, unit, f"<= {limit:g}", bool(value <= limit < math.inf))
 
 
 def at_least(name: str, value: float, unit: str, limit: float) -> Row:
-    return Row(name, value, unit, f">= {limit:g}", bool(value >= limit))
+    """As `at_most`."""
+    return Row(name, value, unit, f">= {limit:g}", bool(value >= limit > -math.inf))
 
 
 def all_of(name: str, met: int, runs: int) -> Row:
@@ -57,6 +61,16 @@ def failed(name: str, why: str) -> Row:
 
 def is_failure(row: Row) -> bool:
     return row.goal == REPORT and row.met is False
+
+
+def skipped(name: str, why: Path | str) -> Row:
+    """What is left out, said. why: the path that is missing, or a sentence."""
+    return Row(f"{name}{SKIPPED}", f"{why} is missing" if isinstance(why, Path) else why)
+
+
+def is_skipped(name: str) -> bool:
+    """Whether a row of this name is one of `skipped`."""
+    return name.endswith(SKIPPED)
 
 
 def timed(
@@ -135,7 +149,7 @@ def main(
     if arguments:
         arguments(parser)
     options = parser.parse_args()
-    made = {"commit": commit(), "machine": machine(), "date": time.strftime("%Y-%m-%d")}  # of what runs from here on
+    made = {"commit": commit(), "machine": processor(), "date": time.strftime("%Y-%m-%d")}  # of what runs from here on
     if options.json:
         try:
             _try_to_write(options.json)

@@ -15,23 +15,23 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
+from bench import pieces
+from bench.aligned import aligned_error
 from bench.baselines.colmap_poses import Model as ColmapModel
 from bench.baselines.colmap_poses import reconstruct
-from bench.pieces import Kept
 from bench.runs import DATA, folder
-from bench.table import Row, at_most, main, names
+from bench.table import Row, at_most, main, names, skipped
 from mvsgs_core import geometry
 from mvsgs_core.datasets import Item, open_dataset
-from mvsgs_core.photographs.reconstruction import Model
+from mvsgs_core.photographs.sparse_map import Model
 from mvsgs_core.photographs.structure import Photographs
 
 NAMES = {  # folder below the data, and photographs that must have a pose in the largest part
@@ -52,7 +52,7 @@ class Solved:
     """What ours made of photographs."""
 
     models: list[Model]
-    seconds: float  # of the processor
+    seconds: float  # of the processor, from images in memory to poses
 
     @property
     def posed(self) -> int:
@@ -79,10 +79,8 @@ def solve(items: Sequence[Item]) -> Solved:
 
 def position_error(ours: np.ndarray, theirs: np.ndarray) -> float:
     """Percent of their path; positions (N, 3) of the same photographs, N at least 3."""
-    scale, rotation, shift = geometry.umeyama(ours, theirs)
-    off = scale * ours @ rotation.T + shift - theirs
     path = np.linalg.norm(np.diff(theirs, axis=0), axis=1).sum()
-    return 100.0 * float(np.sqrt(np.mean(np.sum(off**2, axis=1))) / path)
+    return 100.0 * aligned_error(ours, theirs) / float(path)
 
 
 def positions(model: Model) -> np.ndarray:
@@ -128,8 +126,8 @@ def beside(name: str, items: Sequence[Item], ours: Solved, theirs: ColmapModel |
         off = 100.0 * (ours.models[0].lens.focal(0) / theirs.focal - 1.0)
         rows.append(Row(f"{name}: focal length, from COLMAP's", off, "%"))
     rows.append(Row(f"{name}: processor time", ours.seconds, "s"))
-    rows.append(Row(f"{name}: processor time, COLMAP", theirs.processor_seconds, "s"))
-    ratio = ours.seconds / theirs.processor_seconds
+    rows.append(Row(f"{name}: processor time, COLMAP", theirs.solving_seconds, "s"))
+    ratio = ours.seconds / theirs.solving_seconds
     rows.append(at_most(f"{name}: processor time over COLMAP's", ratio, "", MAX_TIME))
     return rows
 
@@ -170,42 +168,18 @@ def apart(name: str, theirs: ColmapModel, again: ColmapModel) -> list[Row]:
 
 def measure(options: argparse.Namespace) -> list[Row]:
     scenes = options.scenes or list(QUICK if options.quick else NAMES)
-    missing = {name: DATA / NAMES[name][0] for name in scenes if not (DATA / NAMES[name][0]).exists()}
-    skipped = [Row(f"{name}: skipped", f"{path} is missing") for name, path in missing.items()]
+    missing = {name: place for name in scenes if not (place := DATA / NAMES[name][0]).exists()}
+    rows = [skipped(name, place) for name, place in missing.items()]
     scenes = [name for name in scenes if name not in missing]
     measured = partial(scene, both_orders=options.colmap_in_both_orders)
     asked = {"colmap_in_both_orders": options.colmap_in_both_orders}
-    return in_pieces(scenes, folder(options, "wide"), options.resume, options.minutes, measured, asked) + skipped
-
-
-def in_pieces(
-    scenes: Sequence[str], output: Path, resume: bool, minutes: float | None, measured: Callable[[str], list[Row]],
-    asked: Any,
-) -> list[Row]:  # fmt: skip
-    """The rows of all scenes, of which those of another time are read where `resume`; each is kept as it ends.
-
-    minutes: no scene is begun after; None: all are. asked: what else the rows of a scene depend on.
-    """
-    start, rows, kept, missing = time.monotonic(), [], Kept(resume), []
-    for name in scenes:
-        file = output / f"{name}.json"
-        late = minutes is not None and time.monotonic() - start > 60.0 * minutes
-        if late and not kept.has(file, asked):
-            missing.append(name)
-        else:
-            rows += kept.rows(file, asked, partial(measured, name))
-    rows += kept.origin()
-    if missing:
-        rows.append(Row("not measured yet (--resume goes on with them)", ", ".join(missing)))
-    return rows
+    return pieces.in_pieces(scenes, folder(options, "wide"), options.resume, options.minutes, measured, asked) + rows
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     told = "those to measure, by commas; default: all, or the two smallest with --quick"
     parser.add_argument("--scenes", type=names(NAMES), help=told)
-    parser.add_argument("--output", type=Path, help="folder of what was measured; default: in runs")
-    parser.add_argument("--resume", action="store_true", help="keep the scenes that an earlier call measured")
-    parser.add_argument("--minutes", type=float, help="begin no scene after; --resume goes on")
+    pieces.kept_arguments(parser, minutes=True)
     parser.add_argument(
         "--colmap-in-both-orders", action="store_true", help="COLMAP shuffled as well: what its results differ by"
     )

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from bench import pieces
 from bench.baselines import offline, opensplat
-from bench.baselines.colmap_poses import Model, forget
+from bench.baselines.colmap_poses import Model
 from bench.baselines.offline import GAIN, Trained, converged
 from bench.baselines.ours import Ours, ate_percent, cheapest, run_ours, why_not
 from bench.finished import read_frames
@@ -40,12 +40,10 @@ def solve_poses(ours: Ours, place: Path, threads: int, resume: bool) -> tuple[Ba
     """COLMAP's model, from the images as they come, and the frames that it got."""
     stride = max(1, round(len(ours.frames) / EVENLY))
     known = {*ours.keyframes, *(i for i in ours.frames if is_held_out(i) or i % stride == 0)}
-    if not resume:
-        forget(place)
     place.mkdir(parents=True, exist_ok=True)
     whole = read_frames({**ours.settings, "size": None})
     items = [Item(i, whole[i].timestamp, whole[i].image, whole[i].intrinsics) for i in sorted(known)]
-    return solve(items, place, threads), sorted(known)
+    return solve(items, place, threads, pieces.Kept(resume)), sorted(known)
 
 
 def pose_rows(scene: str, ours: Ours, model: Model, frames: list[int]) -> list[Row]:

@@ -23,9 +23,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from bench.pieces import Kept
 from bench.runs import ROOT
-
-KEY = "images.sha256"  # of the images that a folder's model is of
 
 
 @dataclass(frozen=True)
@@ -37,8 +36,9 @@ class Model:
     points: np.ndarray  # (M, 3)
     colors: np.ndarray  # (M, 3) uint8 RGB
     seconds: dict[str, float]  # by stage
-    processor_seconds: float  # of all threads, from start to end
+    processor_seconds: float  # of all threads, from start to end of the process
     focal: float = float("nan")  # pixels, of photographs, where it is estimated
+    solving_seconds: float = float("nan")  # of the processor, from images in memory to poses: no imports, no reading
 
 
 def reconstruct(
@@ -66,25 +66,21 @@ def reconstruct(
 
 
 def reconstruct_once(
-    frames: dict[int, np.ndarray], intrinsics: np.ndarray, folder: Path, threads: int, photographs: bool = False
-) -> tuple[Model | None, str]:
-    """`reconstruct`, or the model that an earlier call left in the folder for the same images."""
+    frames: dict[int, np.ndarray], intrinsics: np.ndarray, folder: Path, threads: int, kept: Kept,
+    photographs: bool = False,
+) -> tuple[Model | None, str]:  # fmt: skip
+    """`reconstruct`, or the model that an earlier call left in the folder for the same images, where those are kept."""
     digest = hashlib.sha256(intrinsics.tobytes())
     for index, image in frames.items():
         digest.update(index.to_bytes(8, "little") + str(image.shape).encode() + image.tobytes())
-    key = folder / KEY
-    if key.exists() and key.read_text() == digest.hexdigest():
+    asked = {"images": digest.hexdigest(), "threads": threads, "photographs": photographs}
+    file = folder / "model.npz"
+    if kept.has(file, asked):
         return load(folder), ""
-    forget(folder)
     model, why = reconstruct(frames, intrinsics, folder, threads, photographs)
     if model is not None:
-        key.write_text(digest.hexdigest())
+        kept.keep(file, asked)
     return model, why
-
-
-def forget(folder: Path) -> None:
-    """`reconstruct_once` makes a new model there."""
-    (folder / KEY).unlink(missing_ok=True)
 
 
 def load(folder: Path) -> Model:
@@ -92,7 +88,8 @@ def load(folder: Path) -> Model:
     with np.load(folder / "model.npz") as arrays:
         index, poses, points, colors = (arrays[name] for name in ("index", "world_from_cam", "points", "colors"))
     times = json.loads((folder / "seconds.json").read_text())
-    return Model(index, poses, points, colors, times["wall"], times["processor"], times.get("focal", float("nan")))
+    focal = times.get("focal", float("nan"))
+    return Model(index, poses, points, colors, times["wall"], times["processor"], focal, times["solving"])
 
 
 def run(folder: Path, threads: int, photographs: bool) -> None:
@@ -114,6 +111,7 @@ def run(folder: Path, threads: int, photographs: bool) -> None:
     mapping.ba_refine_principal_point = False
     mapping.random_seed = 0
     database, images, seconds = folder / "database.db", folder / "images", {}
+    reading, begin = reading_seconds(images), time.process_time()
     start = time.perf_counter()
     pycolmap.extract_features(
         database, images, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader,
@@ -129,6 +127,7 @@ def run(folder: Path, threads: int, photographs: bool) -> None:
     sparse.mkdir(exist_ok=True)
     models = pycolmap.incremental_mapping(database, images, sparse, options=mapping)
     seconds["mapping"] = time.perf_counter() - start
+    solving = time.process_time() - begin - reading
     if not models:
         raise RuntimeError("no model: no two images could be put together")
     best = max(models.values(), key=lambda model: model.num_reg_images())
@@ -139,8 +138,8 @@ def run(folder: Path, threads: int, photographs: bool) -> None:
         pose[:3] = image.cam_from_world().inverse().matrix()
     points = list(best.points3D.values())
     focal = next(iter(best.cameras.values())).mean_focal_length()
-    times = {"wall": seconds, "processor": time.process_time()} | ({"focal": focal} if photographs else {})
-    (folder / "seconds.json").write_text(json.dumps(times))
+    times = {"processor": time.process_time(), "solving": solving} | ({"focal": focal} if photographs else {})
+    (folder / "seconds.json").write_text(json.dumps({"wall": seconds, **times}))
     np.savez(
         folder / "model.npz",
         index=np.array([int(Path(image.name).stem) for image in registered], dtype=np.int64),
@@ -148,6 +147,14 @@ def run(folder: Path, threads: int, photographs: bool) -> None:
         points=np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
         colors=np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
     )
+
+
+def reading_seconds(images: Path) -> float:
+    """Processor seconds of reading all of a folder once, which COLMAP does as it extracts features."""
+    start = time.process_time()
+    for file in sorted(images.glob("*.png")):
+        cv2.imread(str(file))
+    return time.process_time() - start
 
 
 if __name__ == "__main__":

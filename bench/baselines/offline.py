@@ -85,7 +85,7 @@ def train(model: Model, ours: Ours, way: Way, seconds: float, threads: int) -> T
     vignetting = ours.vignetting if way.exposure == "tracker" else None
     fitted = SparseMap([posed(i) for i in chosen if i in poses], model.points, model.colors, config, vignetting)
     fitted.optimize()
-    psnr, ssim = score((view, fitted.render(view)) for view in (posed(i) for i in ours.held_out if i in poses))
+    psnr, ssim = score((view, fitted.render(view)) for view in (posed(i) for i in ours.scored if i in poses))
     return Trained(fitted.seconds, psnr, ssim, len(fitted.state), fitted.iterations, seconds, way.name)
 
 

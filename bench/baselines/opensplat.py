@@ -1,8 +1,9 @@
 """OpenSplat (pierotofy/OpenSplat), a trainer that shares no code with ours, by its binary: COLMAP's model in, .ply out.
 
 It gets every frame that is not held out, at our size, with COLMAP's poses and points, and trains on the CPU. Its map is
-rendered by our rasterizer at COLMAP's poses of the held-out frames. The CPU path of some versions blends splats in
-another order than front to back; the map of such a binary looks right in its own renderer only.
+rendered by our rasterizer at COLMAP's poses of the held-out frames on which ours is scored. The CPU path of some
+versions blends splats in another order than front to back; the map of such a binary looks right in its own renderer
+only.
 """
 
 from __future__ import annotations
@@ -96,5 +97,5 @@ def score_map(file: Path, ours: Ours, model: Model) -> tuple[float, float, int]:
         color = final.render(poses[index], frame.intrinsics, frame.image.shape[:2]).color
         return np.asarray(color.clamp(0, 1).numpy())
 
-    psnr, ssim = score((ours.frames[i], render(i)) for i in ours.held_out if i in poses)
+    psnr, ssim = score((ours.frames[i], render(i)) for i in ours.scored if i in poses)
     return psnr, ssim, len(final.splats)

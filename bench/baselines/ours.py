@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from bench import pieces
 from bench.finished import read_frames
-from bench.runs import Matrix, Run, folder_name, said
+from bench.runs import Matrix, Run, folder_name, held_out_scores, said
 from msgs import GroundTruth
 from mvsgs_core.evaluation import trajectory_metrics
 from mvsgs_core.held_out import is_held_out
@@ -73,6 +73,12 @@ class Ours:
         """Processor seconds from frames to map: all nodes but the evaluator."""
         return processor_seconds(self.report)
 
+    @property
+    def scored(self) -> list[int]:
+        """Frames that are held out and on which our map is scored: those that have a pose."""
+        there = held_out_scores(self.report).keys()
+        return [i for i in self.held_out if i in there]
+
     def psnr(self, frames: set[int]) -> float:
         """Mean over those of `frames` that are held out."""
         return held_out_psnr(self.report, frames)
@@ -80,8 +86,7 @@ class Ours:
 
 def held_out_psnr(report: dict[str, Any], frames: set[int]) -> float:
     """Mean over those of `frames` that are held out in a run."""
-    scores = report["rendering"]["frames"]
-    return float(np.mean([s["psnr"] for s in scores if s["held_out"] and s["index"] in frames]))
+    return float(np.mean([psnr for index, psnr in held_out_scores(report).items() if index in frames]))
 
 
 def processor_seconds(report: dict[str, Any]) -> float:

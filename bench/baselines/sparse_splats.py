@@ -13,13 +13,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from mvsgs_core.evaluation.exposure import frame_exposures
-from mvsgs_core.mapping.background import background_of
+from mvsgs_core.mapping.background import Background
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.exposure import ImageFormation
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView, training_view
 from mvsgs_core.mapping.map_state import MapState
+from mvsgs_core.mapping.optimizer import BETA_1, BETA_2
 from mvsgs_core.mapping.trainer import Trainer
 from mvsgs_core.photometry import vignetting_factor
 from mvsgs_core.rasterizer.rasterize import rasterize
@@ -72,12 +74,13 @@ class SparseMap:
         self.unit = _median_depth(views, points)
         self.state = MapState(1, torch.device("cpu"))
         self._photometry = ImageFormation(vignetting=vignetting)
-        self._trainer = Trainer(config.mapper, self.state, Stats(), self._photometry, EXPOSURE_RATE)
+        self._trainer = Trainer(config.mapper, self.state, Stats(), self._photometry)
         self.seconds = 0.0
         self._random = np.random.default_rng(config.mapper.seed)
         self._given = views
         self._views = [self._training(view) for view in views]
-        self._trainer.background = background_of(self._views)
+        self._moments = {view.index: torch.zeros(2, 3, 4) for view in views}  # of their exposures
+        self._trainer.background = Background(self._views).color
         start = _splats((points - self.origin) / self.unit, colors, config.initial_opacity)
         self.state.append(start, torch.zeros(len(start), dtype=torch.int64))
 
@@ -125,7 +128,7 @@ class SparseMap:
         place = np.argsort(order)
         rows = np.sort(place[1:])
         found = frame_exposures(times[order], measured[order], rows, trained[order[rows] - 1])
-        return None if found is None else found.affines[place[0]]
+        return None if found is None else found[place[0]]
 
     def _done(self, seconds: float) -> float:
         """Share of the work."""
@@ -136,20 +139,35 @@ class SparseMap:
         settling = max(0.0, (done - 1.0 + self.config.settle) / self.config.settle)
         self._trainer.rate = 0.1**settling
         self._trainer.step(view, 1.0, refining=done > self.config.grow)
+        _step_exposure(view, self._moments[view.index])
 
     def _training(self, view: Posed) -> TrainingView:
         unknown = np.zeros(view.image.shape[:2], dtype=np.float32)
         posed = RGBDKeyframe(view.index, view.image, view.intrinsics, view.world_from_cam, unknown)
         training = training_view(posed, self._local(view.world_from_cam), None, self.state.device)
         if view.exposure is not None:
-            training.measured = view.exposure.astype(np.float32)
-            training.exposure = torch.from_numpy(training.measured.copy())
+            training.take_exposure(view.exposure.astype(np.float32))
+            training.exposure.requires_grad_()
         return training
 
     def _local(self, world_from_cam: np.ndarray) -> np.ndarray:
         local = world_from_cam.copy()
         local[:3, 3] = (local[:3, 3] - self.origin) / self.unit
         return local
+
+
+@torch.no_grad()
+def _step_exposure(view: TrainingView, moments: Tensor) -> None:
+    """Adam on the affine of a view that has a known one, drawn toward that. moments: (2, 3, 4)."""
+    gradient, view.exposure.grad = view.exposure.grad, None
+    if gradient is None or view.measured is None or not bool(torch.isfinite(gradient).all()):
+        return
+    gradient = gradient + 1e-3 * (view.exposure - torch.from_numpy(view.measured))
+    first, second = moments
+    first.mul_(BETA_1).add_(gradient, alpha=1 - BETA_1)
+    second.mul_(BETA_2).addcmul_(gradient, gradient, value=1 - BETA_2)
+    mean, square = first / (1 - BETA_1**view.visits), second / (1 - BETA_2**view.visits)
+    view.exposure -= EXPOSURE_RATE * mean / (square.sqrt() + 1e-8)
 
 
 def _median_depth(views: list[Posed], points: np.ndarray) -> float:

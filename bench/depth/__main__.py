@@ -23,14 +23,13 @@ from bench.depth.kernel import kernel_rows
 from bench.depth.oracle import oracle_rows
 from bench.depth.parts import Variant, part_variants, skip_variants, variant_rows
 from bench.depth.photos import PHOTOS, photo_rows
-from bench.depth.pictures import write_pictures
 from bench.depth.pose_refinement import refine_poses
 from bench.depth.run import Run, run, score, surest
 from bench.depth.sensor import sensor_offset, without_offset
 from bench.depth.streets import street_rows
 from bench.depth.tracked import load_tracked
 from bench.runs import DATA, folder
-from bench.table import Row, at_least, at_most, main
+from bench.table import Row, at_least, at_most, main, names, skipped
 from mvsgs_core.fusion.fusion import FusionConfig
 from mvsgs_core.mvs.cascade import CascadeConfig
 
@@ -47,22 +46,20 @@ def measured(name: str, area: int, count: int | None, tracked: bool) -> tuple[Sc
     return scene, run(scene.views, CascadeConfig(area=area), FusionConfig())
 
 
-def available(names: tuple[str, ...]) -> list[str]:
-    return [name for name in names if not SOURCES[name].folder or (DATA / SOURCES[name].folder).exists()]
+def available(wanted: tuple[str, ...]) -> list[str]:
+    return [name for name in wanted if not SOURCES[name].folder or (DATA / SOURCES[name].folder).exists()]
 
 
 def quality_section(options: argparse.Namespace, area: int, tracked: bool) -> list[Row]:
     """Unfiltered and filtered depth, and how well the confidences hold."""
-    names = TRACKED if tracked else tuple(SOURCES)
+    wanted = TRACKED if tracked else tuple(SOURCES)
     if options.quick:
-        names = () if tracked or area == LARGE else ("room",)
-    missing = [name for name in names if name not in available(names)]
-    rows = [Row(f"{name}: skipped, {DATA / SOURCES[name].folder} is missing", None) for name in missing]
-    for name in available(names):
+        wanted = () if tracked or area == LARGE else ("room",)
+    there = available(wanted)
+    rows = [skipped(name, DATA / SOURCES[name].folder) for name in wanted if name not in there]
+    for name in there:
         scene, found = measured(name, area, QUICK if options.quick else None, tracked)
         rows += quality_rows(scene, found, tracked)
-        if options.pictures:
-            write_pictures(scene, found, options.pictures / f"{scene.views[0].size[1]}", tracked)
     return rows
 
 
@@ -149,9 +146,8 @@ def calibration_section(options: argparse.Namespace) -> list[Row]:
 
 
 def baselines_section(options: argparse.Namespace) -> list[Row]:
-    names = ("room",) if options.quick else ("room", "redkitchen")
     rows = []
-    for name in available(names):
+    for name in available(("room",) if options.quick else ("room", "redkitchen")):
         rows += baseline_rows(*measured(name, SMALL, QUICK if options.quick else None, False), align=False)
     if not options.quick and available(("redkitchen",)):
         rows += baseline_rows(*measured("redkitchen", SMALL, None, True), align=True)
@@ -219,16 +215,12 @@ SECTIONS: dict[str, Callable[[argparse.Namespace], list[Row]]] = {
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    chosen = options.only.split(",") if options.only else list(SECTIONS)
-    unknown = [name for name in chosen if name not in SECTIONS]
-    if unknown:
-        raise SystemExit(f"no section {', '.join(unknown)}; there are: {', '.join(SECTIONS)}")
-    return [row for name in chosen for row in SECTIONS[name](options)]
+    return [row for name in options.only for row in SECTIONS[name](options)]
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--only", help=f"comma separated; default all: {','.join(SECTIONS)}")
-    parser.add_argument("--pictures", type=Path, help="folder for pictures of each sequence's depth maps")
+    told = f"comma separated; default all: {','.join(SECTIONS)}"
+    parser.add_argument("--only", type=names(SECTIONS), default=list(SECTIONS), help=told)
     parser.add_argument("--output", type=Path, help="folder of the plots; default: in runs")
 
 

@@ -38,7 +38,6 @@ def part_variants(area: int) -> dict[str, Variant]:
         "3 views that agree, by count alone": (base, replace(fusion, min_views=3, confidence=0.0)),
         "3 views that agree": (base, replace(fusion, min_views=3)),
         "4 maps to check with": (base, replace(fusion, neighbors=4)),
-        "round trip": (base, replace(fusion, round_trip=True)),
         "no confidence threshold": (base, replace(fusion, confidence=0.0)),
         "no filter": (base, replace(fusion, confidence=0.0, check=False)),
     }

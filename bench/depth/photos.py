@@ -17,7 +17,7 @@ import numpy as np
 from bench.depth.run import Run, run
 from bench.depth.tracked import Collected
 from bench.runs import DATA
-from bench.table import Row
+from bench.table import Row, skipped
 from msgs import Frame, GroundTruth
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.fusion.fusion import FusedDepth, FusionConfig
@@ -51,7 +51,7 @@ def photo_rows(area: int, names: list[str]) -> list[Row]:
     rows = []
     for name in names:
         if not (DATA / PHOTOS[name].folder).exists():
-            rows.append(Row(f"{name}: skipped, {DATA / PHOTOS[name].folder} is missing", None))
+            rows.append(skipped(name, DATA / PHOTOS[name].folder))
             continue
         views = load_photos(PHOTOS[name], area)
         if len(views) < 3:

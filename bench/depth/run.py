@@ -31,7 +31,6 @@ class Score:
 
     inliers: float  # part of the kept ones within the tolerance
     completeness: float  # part that is kept
-    outliers: float  # part of the kept ones beyond 3 times the tolerance
     relative_error: float  # mean absolute, of the kept ones
 
 
@@ -88,12 +87,11 @@ def score(depths: list[np.ndarray], scene: Scene, align: bool = False) -> Score:
             depth = scaled_to(depth, truth)
         errors.append(np.abs(depth[kept] - truth[kept]) / truth[kept])
     if not errors or total == 0:
-        return Score(float("nan"), 0.0, float("nan"), float("nan"))
+        return Score(float("nan"), 0.0, float("nan"))
     error = np.concatenate(errors)
     return Score(
         inliers=float(np.mean(error < scene.tolerance)),
         completeness=len(error) / total,
-        outliers=float(np.mean(error > 3 * scene.tolerance)),
         relative_error=float(error.mean()),
     )
 

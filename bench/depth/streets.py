@@ -17,7 +17,7 @@ import numpy as np
 from bench.depth.run import Run, run
 from bench.depth.tracked import Collected
 from bench.runs import DATA
-from bench.table import Row, at_least, at_most
+from bench.table import Row, at_least, at_most, skipped
 from msgs import Frame
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.fusion.fusion import FusionConfig
@@ -59,7 +59,7 @@ def street_rows(area: int) -> list[Row]:
     rows = []
     for name, street in STREETS.items():
         if not (DATA / street.folder).exists():
-            rows.append(Row(f"{name}: skipped, {DATA / street.folder} is missing", None))
+            rows.append(skipped(name, DATA / street.folder))
             continue
         views, points = load_street(street, area)
         withheld = [np.random.default_rng(v.index).random(v.weight.size) < 0.5 for v in views]

@@ -18,7 +18,7 @@ from mvsgs_core.export.command_line import input_arguments, known_cameras, read_
 from mvsgs_core.export.keyframe_render import near_plane
 from mvsgs_core.export.render_path import main as render_path
 from mvsgs_core.export.snapshot import Snapshot
-from mvsgs_core.mapping.preview import as_bytes
+from mvsgs_core.rasterizer.interface import as_bytes
 
 SPLATS = ("gaussians.ply", "map.splat", "map.spz")
 MESHES = ("mesh.ply", "mesh.obj", "mesh.glb", "mesh.stl", "mesh.off")

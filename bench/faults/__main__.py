@@ -8,22 +8,19 @@ from __future__ import annotations
 import argparse
 import importlib
 
-from bench.table import Row, main
+from bench.table import Row, main, names
 
 PARTS = ("equal", "files", "frames", "hours", "kills", "newest", "worst")  # modules of bench.faults
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--only", default="", help=f"parts, of {', '.join(PARTS)}; default: all")
+    told = f"parts, of {', '.join(PARTS)}; default: all"
+    parser.add_argument("--only", type=names(PARTS), default=list(PARTS), help=told)
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    wanted = options.only.split(",") if options.only else PARTS
-    unknown = set(wanted) - set(PARTS)
-    if unknown:
-        raise SystemExit(f"--only={options.only}: the parts are {', '.join(PARTS)}")
     rows: list[Row] = []
-    for name in wanted:
+    for name in options.only:
         print(f"{name} ...", flush=True)
         rows += importlib.import_module(f"bench.faults.{name}").measure(options.quick)
     return rows

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import statistics
 import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import dataclass, field
@@ -19,7 +18,7 @@ from pathlib import Path
 import psutil
 
 from bench.memory import resident
-from bench.runs import ROOT, environment
+from bench.runs import ROOT, environment, launcher
 from bench.table import Row, at_most
 
 GROWTH = 1.1  # memory of a process at the end over that after it has settled
@@ -51,7 +50,7 @@ def _watched(folder: Path, frames: int) -> tuple[Samples, list[tuple[float, int]
     """A run: its samples, when how many frames had been sent, and counts of its report. Raises where it fails."""
     output, progress = folder / "out", folder / "progress"
     command = [
-        sys.executable, str(ROOT / "launch/run_all.py"), f"output={output}", *OVERRIDES,
+        *launcher(), f"output={output}", *OVERRIDES,
         "dataset._target_=bench.faults.to_and_fro.ToAndFro", f"dataset.frames={frames}", f"dataset.progress={progress}",
     ]  # fmt: skip
     samples = Samples()

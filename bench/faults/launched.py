@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -16,7 +15,7 @@ from typing import Any
 
 import psutil
 
-from bench.runs import ROOT
+from bench.runs import ROOT, launcher
 from mvsgs_core.export.ply import read_ply
 
 
@@ -29,7 +28,7 @@ class Launched:
         self._temporary = Path(tempfile.mkdtemp(prefix="f", dir="/tmp"))  # short: a socket's path must fit
         self._log = (output.parent / f"{output.name}.log").open("w+")
         self.process = subprocess.Popen(
-            [sys.executable, ROOT / "launch/run_all.py", *arguments],
+            [*launcher(), *arguments],
             stdout=self._log,
             stderr=subprocess.STDOUT,
             cwd=ROOT,

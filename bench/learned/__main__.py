@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import os
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -28,7 +28,7 @@ from bench.depth.run import Score, depth_view, score
 from bench.depth.tracked import load_tracked
 from bench.runs import DATA, environment
 from bench.runs import folder as folder_of
-from bench.table import Row, main
+from bench.table import Row, main, skipped
 from bench.tracking.__main__ import run as track
 from mvsgs_core import weights
 from mvsgs_core.datasets import open_dataset
@@ -148,8 +148,9 @@ def flow_rows(name: str, frames: int | None) -> list[Row]:
     rows = []
     for flow in ("lucas_kanade", "raft_small"):
         result = track(items, TrackerConfig(flow=flow))
-        error = 100 * max(result.keyframe_errors, default=float("nan"))
+        error = 100 * result.worst_of_keyframes
         rows.append(Row(f"{name}, {flow}: ATE keyframes", error, f"cm, {result.keyframes} keyframes"))
+        rows += result.unknown(f"{name}, {flow}")
         rows.append(Row(f"{name}, {flow}: processor", 1e3 * result.total / len(items), "ms a frame"))
     return rows
 
@@ -171,14 +172,14 @@ def measure(options: argparse.Namespace) -> list[Row]:
 
 def _there(name: str, network: str, rows: list[Row]) -> bool:
     """Whether a sequence and a network's weights are there; if not, a row says what is missing."""
-    missing: Iterable[str] = ()
+    missing: tuple[Path | str, ...] = ()
     if not (DATA / SOURCES[name].folder).exists():
-        missing = (f"{DATA / SOURCES[name].folder} is missing",)
+        missing = (DATA / SOURCES[name].folder,)
     try:
         weights.find(network)
     except FileNotFoundError as error:
         missing = (*missing, str(error))
-    rows += [Row(f"{name}, {network}: skipped", text) for text in missing]
+    rows += [skipped(f"{name}, {network}", why) for why in missing]
     return not missing
 
 

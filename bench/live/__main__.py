@@ -13,7 +13,6 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from bench.live.recordings import SCENES, available, recording
-from bench.pieces import Kept
-from bench.runs import ROOT, environment, figure, folder, folder_name
-from bench.table import Row, at_least, at_most, failed, main, names
+from bench.pieces import Kept, kept_arguments
+from bench.runs import ROOT, environment, figure, folder, folder_name, held_out_scores, launcher
+from bench.table import Row, at_least, at_most, failed, main, names, skipped
 from mvsgs_core.mvs.cascade import Cascade
 
 ALL = tuple(range(len(Cascade.efforts)))
@@ -73,9 +72,7 @@ class Result:
 
     def held_out(self, refined: bool) -> dict[int, float]:
         """PSNR, dB, by frame."""
-        part = "rendering" if refined else "rendering_before_refinement"
-        frames = (self.report or {}).get(part, {}).get("frames", [])
-        return {frame["index"]: frame["psnr"] for frame in frames if frame["held_out"] and frame["psnr"] is not None}
+        return held_out_scores(self.report, "rendering" if refined else "rendering_before_refinement")
 
     def count(self, node: str, what: str) -> float:
         return float((self.report or {}).get("counts", {}).get(node, {}).get(what, 0.0))
@@ -100,10 +97,7 @@ def run(scene: str, way: Way, place: Path, options: argparse.Namespace, kept: Ke
     output.mkdir(parents=True)
     path = recording(scene, place, options.stop)
     cores = ",".join(map(str, sorted(os.sched_getaffinity(0))[: way.cores]))
-    command = [
-        "taskset", "-c", cores, sys.executable, str(ROOT / "launch" / "run_all.py"), f"dataset.path={path}",
-        f"output={output}", *given,
-    ]  # fmt: skip
+    command = ["taskset", "-c", cores, *launcher(), f"dataset.path={path}", f"output={output}", *given]
     with (output.parent / f"{output.name}.log").open("w") as log:
         subprocess.run(command, cwd=ROOT, env=environment(), stdout=log, stderr=subprocess.STDOUT, check=False)
     report = json.loads(file.read_text()) if file.exists() else None
@@ -136,10 +130,10 @@ def efforts(live: Result) -> str:
     """Keyframes on which less than the full effort was made, by stage and effort."""
     found = []
     for node in ("mvs", "depth_fusion", "mapper"):
-        skipped = (live.report or {}).get("skipped", {}).get(node, {})
+        counts = (live.report or {}).get("skipped", {}).get(node, {})
         found += [
             f"{name.removeprefix('effort on keyframes: ')} {count:.0f}"
-            for name, count in skipped.items()
+            for name, count in counts.items()
             if name.startswith("effort on keyframes: ")
         ]
     return "; ".join(found) or "none"
@@ -193,8 +187,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     told = f"comma separated, of {', '.join(SCENES)}; default: those whose data are here"
     parser.add_argument("--scenes", type=names(SCENES), help=told)
     parser.add_argument("--stop", type=int, help="frames of each; default: all")
-    parser.add_argument("--resume", action="store_true", help="what the same command left is not run again")
-    parser.add_argument("--output", type=Path, help="folder of the runs; default: runs/bench/live")
+    kept_arguments(parser)
     parser.add_argument("overrides", nargs="*", help="for all runs, such as mapper.refinement=300")
 
 
@@ -205,7 +198,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
         scenes, options.stop = ["room"], options.stop or 90
     place, kept = folder(options, "live"), Kept(options.resume)
     rows = [row for scene in scenes if scene in there for row in measure_scene(scene, place, options, kept)]
-    rows += [Row(f"{scene}: skipped", f"{SCENES[scene]['path']} is missing") for scene in scenes if scene not in there]
+    rows += [skipped(scene, SCENES[scene]["path"]) for scene in scenes if scene not in there]
     return rows + kept.origin()
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from bench.pieces import Kept
 from bench.runs import DATA
 from nodes.reader import Reader
 from nodes.recorder import Recorder
@@ -25,19 +28,24 @@ def available() -> list[str]:
 
 
 def recording(scene: str, folder: Path, stop: int | None = None) -> Path:
-    """The file of a scene, up to frame `stop`, made where it is not there yet."""
+    """The file of a scene, up to frame `stop`, made where it is not there yet, or is of another reader or size."""
     path = folder / f"{scene}{'' if stop is None else f'_{stop}'}.mcap"
-    if path.exists():
-        return path
-    aside = path.with_suffix(".part")
-    aside.unlink(missing_ok=True)
-    reader = Reader(Reader.Config(**SCENES[scene], stop=stop))
-    recorder = Recorder(Recorder.Config(path=str(aside), foxglove=False))
-    for message in reader.run():
-        recorder.on_message(message)
-    list(recorder.on_end())
-    aside.rename(path)
+    kept, asked = Kept(True), json.loads(json.dumps({**SCENES[scene], "stop": stop}, default=str))
+    if not kept.has(path, asked):
+        write(Reader(Reader.Config(**SCENES[scene], stop=stop)).run(), path)
+        kept.keep(path, asked)
     return path
 
 
-__all__ = ["SCENES", "available", "recording"]
+def write(messages: Iterable[Any], file: Path) -> Path:
+    """A recording of messages, for the player; the file is there once it is whole."""
+    aside = file.with_suffix(".part")
+    aside.unlink(missing_ok=True)
+    recorder = Recorder(Recorder.Config(path=str(aside), foxglove=False))
+    for message in messages:
+        recorder.on_message(message)
+    list(recorder.on_end())
+    return aside.rename(file)
+
+
+__all__ = ["SCENES", "available", "recording", "write"]

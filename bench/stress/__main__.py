@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from bench import pieces
 from bench.memory import flat_rows, sampled
 from bench.runs import Matrix, Run, Setting, figure, folder, said
-from bench.table import Row, at_most, main
+from bench.table import Row, at_most, main, names
 
 SMALL = (
     "dataset.size=[180,240]", "dataset.stop=90", "tracker.area=43200", "mvs.area=43200",
@@ -193,10 +193,7 @@ def _go(matrix: Matrix, options: argparse.Namespace, name: str) -> list[Run]:
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    groups = ["difficulties"] if options.quick else options.only.split(",")
-    unknown = sorted(set(groups) - set(GROUPS))
-    if unknown:
-        raise SystemExit(f"no group {', '.join(unknown)}; there are: {', '.join(GROUPS)}")
+    groups = ["difficulties"] if options.quick else options.only
     overrides = [*SMALL, *options.overrides]
     if options.quick:
         overrides += ["dataset.stop=70", "mapper.iterations=10", "mapper.refinement=30"]
@@ -216,7 +213,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
         pinned = Matrix(["room"], overrides=overrides, prefix=("taskset", "-c", "0"))
         rows += one_run("one core", pinned, options, easy)
     if "slow_node" in groups:
-        slow = "depth_fusion._target_=bench.stress.slow_fusion.SlowFusion"
+        slow = "depth_fusion._target_=bench.live.slow.SlowFusion"
         rows += one_run("depth fusion 10 times as slow", Matrix(["room"], overrides=[*overrides, slow]), options, easy)
     if "long" in groups:
         rows += long_run(options)
@@ -224,7 +221,8 @@ def measure(options: argparse.Namespace) -> list[Row]:
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--only", default=",".join(GROUPS), help=f"comma separated: {', '.join(GROUPS)}")
+    told = f"comma separated, of {', '.join(GROUPS)}; default: all"
+    parser.add_argument("--only", type=names(GROUPS), default=list(GROUPS), help=told)
     parser.add_argument("--frames", type=int, default=2000, help="of the long run")
     pieces.arguments(parser, "mapper.iterations=10", jobs=True)
 

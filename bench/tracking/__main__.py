@@ -8,6 +8,7 @@ core run COLMAP, on the same frames, and then a long stream whose memory is watc
 from __future__ import annotations
 
 import argparse
+import math
 import multiprocessing
 import time
 from collections.abc import Sequence
@@ -19,12 +20,14 @@ from typing import Any
 import cv2
 import numpy as np
 
+from bench.aligned import aligned_error
 from bench.runs import folder
-from bench.table import Row, at_most, main
+from bench.table import Row, at_most, main, skipped
 from bench.tracking import baselines, curves, loop, memory
-from bench.tracking.baselines import Baseline, aligned_error
+from bench.tracking.baselines import Baseline
 from bench.tracking.cases import CASES, Case
 from bench.tracking.parts import global_adjustment_seconds
+from bench.tracking.track import track
 from mvsgs_core.datasets import Item
 from mvsgs_core.tracking.tracker import Tracker, TrackerConfig
 from mvsgs_core.trajectory import TrackingState, Trajectory
@@ -32,7 +35,7 @@ from mvsgs_core.trajectory import TrackingState, Trajectory
 
 @dataclass(frozen=True)
 class Result:
-    """One run over one sequence. Errors in the unit of the truth (meters)."""
+    """One run over one sequence. Errors in the unit of the truth (meters), NaN of a segment that has too few frames."""
 
     path: Trajectory
     keyframe_errors: list[float]  # of each segment
@@ -51,18 +54,29 @@ class Result:
     def unposed(self) -> int:
         return int(np.sum(~np.isfinite(self.path.world_from_cam).all(axis=(1, 2))))
 
+    @property
+    def worst(self) -> float:
+        """Of the frames' errors the largest; NaN where one is not known, or there is no segment."""
+        return worst(self.frame_errors)
+
+    @property
+    def worst_of_keyframes(self) -> float:
+        return worst(self.keyframe_errors)
+
+    def unknown(self, name: str) -> list[Row]:
+        """What must be said of segments that have no error; nothing where all have one."""
+        pairs = zip(self.frame_errors, self.keyframe_errors, strict=True)
+        count = sum(any(map(math.isnan, pair)) for pair in pairs)
+        return [Row(f"{name}: segments without a known error", count)] if count else []
+
+
+def worst(errors: Sequence[float]) -> float:
+    return float(np.max(errors)) if errors else math.nan
+
 
 def run(items: Sequence[Item], config: TrackerConfig | None = None) -> Result:
-    tracker = Tracker(config, clock=time.process_time)
-    start = time.process_time()
-    for item in items:
-        tracker.add(item.index, item.timestamp, item.image, item.intrinsics, mask=item.mask)
-    total = time.process_time() - start
-    start = time.process_time()
-    for _ in tracker.finish():
-        pass
-    end = time.process_time() - start
-    path = tracker.trajectory()
+    tracked = track(items, Tracker(config, clock=time.process_time))
+    path, stats = tracked.tracker.trajectory(), tracked.tracker.stats
     truth = {i.index: i.world_from_cam for i in items if i.world_from_cam is not None}
     segments = sorted({int(s) for s in path.segment if s >= 0})
     known = np.isin(path.index, list(truth)) & np.isfinite(path.world_from_cam).all(axis=(1, 2))
@@ -72,10 +86,10 @@ def run(items: Sequence[Item], config: TrackerConfig | None = None) -> Result:
         [_ate(path, truth, known & path.keyframe & (path.segment == s)) for s in segments],
         [_ate(path, truth, known & (path.segment == s)) for s in segments],
         float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()) if len(positions) > 1 else 0.0,
-        tracker.stats.seconds,
-        total,
-        end,
-        tracker.stats.warnings,
+        stats.seconds,
+        tracked.seconds,
+        tracked.end,
+        stats.warnings,
     )
 
 
@@ -89,19 +103,20 @@ def _ate(path: Trajectory, truth: dict[int, np.ndarray], chosen: np.ndarray) -> 
 
 def rows_of(name: str, case: Case, results: list[Result]) -> list[Row]:
     first = results[0]
-    keyframe = [100.0 * max(r.keyframe_errors, default=float("nan")) for r in results]
+    keyframe = [100.0 * r.worst_of_keyframes for r in results]
     rows = [_ate_row(f"{name}: ATE keyframes", float(np.max(keyframe)), case.goal, first.length)]
     if len(results) > 1:
         rows.append(at_most(f"{name}: spread of {len(results)} runs", float(np.ptp(keyframe)), "cm", 1e-9))
         rows.append(at_most(f"{name}: the same run again, largest difference", _difference(results), "", 0.0))
-    rows.append(Row(f"{name}: ATE all frames", 100.0 * max(first.frame_errors, default=float("nan")), "cm"))
+    rows.append(Row(f"{name}: ATE all frames", 100.0 * first.worst, "cm"))
+    rows += first.unknown(name)
     rows.append(Row(f"{name}: keyframes", first.keyframes, f"of {len(first.path.index)}"))
     states = {s.name.lower(): int(np.sum(first.path.state == s)) for s in TrackingState if s != TrackingState.TRACKED}
     if case.hard:
         told = first.unposed == 0 or any("lost" in w or "start" in w for w in first.warnings)
         segments = len(first.keyframe_errors)
         told &= segments <= 1 or any("segments" in w for w in first.warnings)
-        wrong = max([*first.frame_errors, 0.0]) / max(first.length, 1e-9)
+        wrong = (first.worst if segments else 0.0) / max(first.length, 1e-9)
         rows.append(Row(f"{name}: without a pose", first.unposed, str(states), "reported", bool(told)))
         rows.append(at_most(f"{name}: error over path, {segments} segments", 100.0 * wrong, "%", 4.0))
     else:
@@ -139,7 +154,7 @@ def curve(name: str, items: Sequence[Item], folder: Path) -> list[Row]:
     def one(config: TrackerConfig) -> tuple[float, float, int]:
         result = run(items, config)
         milliseconds = 1e3 * result.total / len(items)
-        return milliseconds, 100.0 * max(result.keyframe_errors, default=float("nan")), result.keyframes
+        return milliseconds, 100.0 * result.worst_of_keyframes, result.keyframes
 
     points = curves.measure(one)
     curves.draw(folder / f"{name}.svg", points)
@@ -180,7 +195,7 @@ def rows_of_case(name: str, case: Case, options: argparse.Namespace) -> list[Row
     try:
         items = case.items()
     except FileNotFoundError as error:
-        return [Row(f"{name}: skipped", str(error))]
+        return [skipped(name, str(error))]
     return rows_of(name, case, [run(items) for _ in range(1 if options.quick else options.runs)])
 
 

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.aligned import aligned_error
 from bench.baselines.colmap_poses import Model, reconstruct_once
+from bench.pieces import Kept
 from bench.table import Row, at_most
 from bench.tracking.cases import CASES
-from mvsgs_core import geometry
 from mvsgs_core.camera import fit_size, resize_image, scale_intrinsics
 from mvsgs_core.datasets import Item
 from mvsgs_core.trajectory import Trajectory
@@ -29,13 +30,13 @@ class Baseline:
     size: tuple[int, int]
 
 
-def solve(items: Sequence[Item], folder: Path, threads: int) -> Baseline:
-    """COLMAP's model of the frames. One that an earlier call left in `folder` for the same images is taken again."""
+def solve(items: Sequence[Item], folder: Path, threads: int, kept: Kept) -> Baseline:
+    """COLMAP's model of the frames, or the one that an earlier call left in `folder` for the same images."""
     size = items[0].image.shape[0], items[0].image.shape[1]
     small = fit_size(*size, AREA) if size[0] * size[1] > AREA else size
     frames = {i.index: resize_image(i.image, small) for i in items}
     intrinsics = scale_intrinsics(items[0].intrinsics, size, small)
-    return Baseline(*reconstruct_once(frames, intrinsics, folder, threads), small)
+    return Baseline(*reconstruct_once(frames, intrinsics, folder, threads, kept), small)
 
 
 def solve_case(name: str, folder: Path) -> Baseline:
@@ -43,11 +44,14 @@ def solve_case(name: str, folder: Path) -> Baseline:
     case = CASES[name]
     place = folder / "".join(c if c.isalnum() else "_" for c in name)
     place.mkdir(parents=True, exist_ok=True)
-    return solve(case.items()[:: case.baseline_stride], place, 1)
+    return solve(case.items()[:: case.baseline_stride], place, 1, Kept(True))
 
 
 def rows(name: str, baseline: Baseline, path: Trajectory, items: Sequence[Item], seconds: float) -> list[Row]:
-    """Both errors over the frames that COLMAP registered and we posed; seconds: processor time of our whole run."""
+    """Both errors over the frames that COLMAP registered and we posed.
+
+    seconds: processor time of our whole run, from images in memory to poses, as COLMAP's here.
+    """
     model = baseline.model
     if model is None:
         return [Row(f"{name}: pycolmap", baseline.why)]
@@ -67,16 +71,10 @@ def rows(name: str, baseline: Baseline, path: Trajectory, items: Sequence[Item],
         found.append(at_most(ratio, mine / his, "", 1.2))
     else:
         found.append(Row(ratio, mine / his, "(it failed: most frames are not registered)"))
-    total = model.processor_seconds
+    total = model.solving_seconds
     return [*found, Row(f"{name}: seconds, pycolmap's / ours", total / seconds, f"({total:.0f} / {seconds:.1f} s CPU)")]
 
 
 def _every(name: str) -> str:
     stride = CASES[name].baseline_stride
     return "" if stride == 1 else f", one of {stride}"
-
-
-def aligned_error(found: np.ndarray, wanted: np.ndarray) -> float:
-    """RMS distance of positions (N, 3) after Sim(3) alignment."""
-    s, r, t = geometry.umeyama(found, wanted)
-    return float(np.sqrt(np.mean(np.sum(np.square(s * found @ r.T + t - wanted), axis=1))))

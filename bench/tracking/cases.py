@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bench.runs import DATA
-from bench.table import Row
+from bench.table import Row, skipped
 from mvsgs_core.datasets import Item, open_dataset
 
 NOISE = 1.5  # gray levels, of a sensor in the dark
@@ -49,9 +49,9 @@ class Case:
         return items if clear else [_dimmed(item, self.light, self.haze) for item in items]
 
 
-def skipped(cases: Mapping[str, Case]) -> list[Row]:
+def missing(cases: Mapping[str, Case]) -> list[Row]:
     """A row for each whose data is not on this machine: no table leaves one out in silence."""
-    return [Row(f"{name}: skipped", f"{case.path} is not there") for name, case in cases.items() if not case.there]
+    return [skipped(name, case.path) for name, case in cases.items() if case.path is not None and not case.there]
 
 
 def _dimmed(item: Item, light: float, haze: float) -> Item:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bench.aligned import aligned_error
 from bench.table import Row, at_least, at_most
-from bench.tracking.baselines import aligned_error
 from mvsgs_core import geometry, image_metrics
 from mvsgs_core.datasets import Item
 from mvsgs_core.mapping.config import MapperConfig
@@ -22,6 +22,7 @@ from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.publish import Correction
+from mvsgs_core.tracking.steps import whole
 from mvsgs_core.tracking.tracker import Tracker, TrackerConfig
 
 PIXELS = 160 * 120  # of the mapper's images
@@ -60,7 +61,7 @@ def close_loop(items: Sequence[Item], drift: float = 0.25) -> Closed:
     error = _error(graph, order, items)
     for index in order[:-1]:
         session.loops.add(index)
-    closure = session.loops.search(order[-1])
+    closure = whole(session.loops.searching(order[-1]))
     if closure is None or not closure.moved:
         return Closed(before, units, None, error, error)
     session.back_end.adjust(graph.keyframes[order[0]].segment)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import stat
 import struct
@@ -95,6 +96,7 @@ def test_colmap_s_model_of_other_images_is_not_taken(tmp_path: Path, monkeypatch
 
     def reconstruct(frames: dict[int, np.ndarray], *args: Any) -> tuple[Model, str]:
         made.append(frames[0].size)
+        (args[1] / "model.npz").touch()
         return NO_MODEL, ""
 
     monkeypatch.setattr(colmap_poses, "reconstruct", reconstruct)
@@ -104,6 +106,43 @@ def test_colmap_s_model_of_other_images_is_not_taken(tmp_path: Path, monkeypatch
         frames = {0: replace(small.frames[0], image=np.zeros((2, size, 3), np.uint8))}
         assert photographs.colmap(replace(small, frames=frames), tmp_path, resume) == (NO_MODEL, "")
     assert made == [24, 36, 36]
+
+
+def test_theirs_is_scored_where_ours_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A held-out frame of which ours has no pose counts for neither."""
+    ours = six_frames()
+    frames = {**ours.frames, 10: replace(ours.frames[5], index=10)}
+    ours = replace(ours, frames=frames)
+    assert ours.held_out == [5, 10]
+    assert ours.scored == [5]
+    scored: list[int] = []
+
+    class Map:
+        seconds, iterations, state = 1.0, 1, ()
+
+        def __init__(self, views: list[Posed], *_: Any) -> None:
+            self.views = views
+
+        def optimize(self) -> None:
+            trained.append([view.index for view in self.views])
+
+        def render(self, view: Posed) -> np.ndarray:
+            scored.append(view.index)
+            return view.image / np.float32(255.0)
+
+    trained: list[list[int]] = []
+    monkeypatch.setattr(offline, "SparseMap", Map)
+    monkeypatch.setattr(offline, "score", lambda pairs: (float(len(list(pairs))), 1.0))
+    known = np.array([0, 1, 2, 3, 4, 5, 10])
+    model = replace(NO_MODEL, index=known, world_from_cam=np.tile(np.eye(4), (7, 1, 1)))
+    offline.train(model, ours, Way(frames="all"), 1.0, 1)
+    assert scored == [5]
+    assert trained == [[0, 1, 2, 3, 4]]
+
+
+def test_theirs_gets_photographs_that_ours_could_not_register() -> None:
+    for quick in (False, True):
+        assert photographs.ways(argparse.Namespace(quick=quick))["frames"] == ("all",)
 
 
 def test_the_error_of_other_poses_is_taken_over_common_frames_after_alignment() -> None:
@@ -244,6 +283,19 @@ def test_a_known_exposure_is_of_use_to_the_offline_map() -> None:
     found = fitted.exposure_of(posed(between[1], True))
     assert found is not None
     assert np.allclose(found, np.eye(3, 4) * gain(3), atol=0.05)
+
+
+@pytest.mark.slow
+def test_what_an_exposure_is_off_by_is_trained() -> None:
+    """Light that falls by the frame, of which nobody knows."""
+    training, _, points, colors = room(2, lambda k: 1.0 - 0.05 * k)
+    views = [replace(view, exposure=np.eye(3, 4)) for view in training]
+    fitted = SparseMap(views, points, colors, SparseConfig(iterations=120, mapper=ON_CPU))
+    fitted.optimize()
+    found = [fitted.exposure_of(view) for view in views]
+    gains = [float(np.trace(affine[:, :3])) / 3.0 for affine in found if affine is not None]
+    assert len(gains) == len(views)
+    assert gains[0] > gains[-1] + 0.01
 
 
 def a_map(file: Path, color: float) -> None:

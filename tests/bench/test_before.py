@@ -80,12 +80,22 @@ def test_keyframes_may_be_a_decibel_ahead_of_held_out_frames() -> None:
     assert not far[f"{name}, after"].met
 
 
+def framed(found: dict[str, Any], *frames: int, psnr: float | None = None) -> dict[str, Any]:
+    """With figures of its held-out frames: each as the mean, where nothing else is given."""
+    value = found["rendering"]["held_out"]["psnr"] if psnr is None else psnr
+    found["rendering"]["frames"] = [{"index": i, "psnr": value, "held_out": True} for i in frames]
+    return found
+
+
 def test_the_cheapest_as_good_as_before_is_what_its_map_costs_now() -> None:
-    old = some("room", report(30.0, 10.0), report(30.0, 10.0))
+    def seeds(*figures: tuple[float, float]) -> list[Run]:
+        return some("room", *(framed(report(*one), 0, 5) for one in figures))
+
+    old = seeds((30.0, 10.0), (30.0, 10.0))
     candidates = {
-        "after": some("room", report(33.0, 10.0), report(33.0, 10.0)),
-        "10": some("room", report(30.5, 5.0), report(29.7, 3.0)),
-        "5": some("room", report(29.0, 1.0), report(30.5, 1.0)),
+        "after": seeds((33.0, 10.0), (33.0, 10.0)),
+        "10": seeds((30.5, 5.0), (29.7, 3.0)),
+        "5": seeds((29.0, 1.0), (30.5, 1.0)),
     }
     rows = by_name(before.at_equal_quality("room", old, candidates))
     assert rows["At before's PSNR: room: cheapest"].value == "10"
@@ -95,12 +105,16 @@ def test_the_cheapest_as_good_as_before_is_what_its_map_costs_now() -> None:
     assert [row.met for row in none] == [False]
 
 
+def test_frames_that_are_not_held_out_in_both_make_no_map_as_good_as_before() -> None:
+    old = some("room", framed(report(30.0, 10.0), 0, 5))
+    easier = framed(report(35.0, 5.0), 0, psnr=29.0)  # the mean is of other frames, too
+    rows = before.at_equal_quality("room", old, {"5": some("room", easier)})
+    assert [row.value for row in rows] == ["none is as good"]
+
+
 def test_the_best_map_in_the_time_of_before_tells_what_is_gained_in_it() -> None:
     def timed(psnr: float, seconds: float) -> list[Run]:
-        frames = [{"index": i, "psnr": psnr, "held_out": True} for i in (0, 5)]
-        made = report(psnr, seconds=seconds)
-        made["rendering"]["frames"] = frames
-        return some("room", made)
+        return some("room", framed(report(psnr, seconds=seconds), 0, 5))
 
     old = timed(30.0, 10.0)
     candidates = {"30": timed(32.0, 11.0), "20": timed(31.0, 9.0), "10": timed(30.5, 5.0)}

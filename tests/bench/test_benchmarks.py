@@ -98,7 +98,7 @@ def test_settings_override_choices_and_parameters(tmp_path: Path) -> None:
 
 
 def test_a_slow_node_and_the_track_recorder_stand_in_the_graph() -> None:
-    graph = compose([SEARCH, "+scene=room", "depth_fusion._target_=bench.stress.slow_fusion.SlowFusion"])
+    graph = compose([SEARCH, "+scene=room", "depth_fusion._target_=bench.live.slow.SlowFusion"])
     assert graph.slots["depth_fusion"].config["factor"] == 10.0
     with pytest.raises(GraphError, match="recorder has no choice"):
         compose(["recorder=track"])

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from bench.depth import failures
 from bench.depth.__main__ import SECTIONS, SMALL
 from bench.depth.calibration import fit, reliability
 from bench.depth.curves import Point, settings
@@ -27,7 +30,6 @@ def test_scores_count_what_is_kept_and_what_is_right() -> None:
     found = score([depth, depth], scene(truth))
     assert found.completeness == pytest.approx(7 / 9)
     assert found.inliers == pytest.approx(5 / 7)
-    assert found.outliers == pytest.approx(1 / 7)
     assert found.relative_error == pytest.approx((0.025 + 0.1 + 0.5) / 7)
     assert score([3 * depth, depth], scene(truth), align=True).inliers == found.inliers
     assert score([np.zeros_like(depth), depth], scene(truth)).completeness == 0
@@ -143,3 +145,17 @@ def test_the_default_runs_in_turns_with_its_variants(monkeypatch: pytest.MonkeyP
     assert (rows["default: processor time"].value, rows["default: processor time"].spread) == (8000.0, 2000.0)
     changes = [rows[f"{name}: processor time, change"].value for name in "abc"]
     assert changes == ["~ +1e+03", "~ -1e+03", "-5e+03"]
+
+
+def test_a_filter_that_keeps_nothing_has_no_outliers_and_misses_its_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    truth = np.ones((2, 5), np.float32)
+    nothing = SimpleNamespace(depth=np.zeros_like(truth), counts={"pixels": 10.0})
+    monkeypatch.setattr(
+        failures, "FAILURES", {"exposure change": lambda room: room, failures.NOTHING: lambda room: room}
+    )
+    monkeypatch.setattr(failures, "load_scene", lambda *_, **__: scene(truth))
+    monkeypatch.setattr(failures, "run", lambda *_: Run([], [nothing, nothing], 0.0, 0.0))
+    met = {row.name: row.met for row in failures.failure_rows(SMALL, None)}
+    assert met["exposure change: outliers of kept"] is True
+    assert met["exposure change: kept"] is False
+    assert met[f"{failures.NOTHING}: kept"] is None

@@ -16,7 +16,7 @@ pytest.importorskip("triton", reason="triton is not installed: pip install trito
 
 from bench import gpu, networks, record
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.gpu]
 
 MEASURE = gpu.milliseconds
 

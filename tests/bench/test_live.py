@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from bench.live.__main__ import FIXED, ONE_CORE, SLOW, WITHOUT, Result, below, efforts, rows_of_pace, run
+from bench.live.__main__ import FIXED, ONE_CORE, SLOW, WITHOUT, Result, below, efforts, rows_of_loss, rows_of_pace, run
 from bench.live.recordings import SCENES, recording
 from bench.live.slow import SlowFusion, SlowMapper, SlowStereo, slowed
 from bench.pieces import Kept
@@ -34,6 +34,14 @@ def test_maps_are_compared_on_the_held_out_frames_that_both_know() -> None:
 def test_a_run_that_failed_meets_no_goal() -> None:
     rows = rows_of_pace("x", Result(None))
     assert [row.met for row in rows if row.goal] == [False] * 4
+
+
+def test_without_the_governed_run_the_others_have_no_goal_to_meet() -> None:
+    unhurried, nothing = report({0: 21.0}), Result(None)
+    goal = below(nothing, unhurried, False) + 2.0
+    for found in (nothing, report({0: 20.0})):
+        rows = rows_of_loss("x", found, unhurried, goal)
+        assert [row.met for row in rows if row.goal] == [False]
 
 
 def test_only_a_finished_run_of_the_same_settings_is_taken_again(
@@ -91,7 +99,8 @@ def test_a_recording_is_made_once_and_played_at_its_pace(tmp_path: Path, monkeyp
     given = {"name": "synthetic", "size": [24, 32], "options": {"frames": 3}}
     monkeypatch.setitem(SCENES, "tiny", given)
     path = recording("tiny", tmp_path)
-    assert recording("tiny", tmp_path).stat().st_mtime_ns == path.stat().st_mtime_ns
+    made = path.stat().st_mtime_ns
+    assert recording("tiny", tmp_path).stat().st_mtime_ns == made
     began = time.monotonic()
     played = [m for m in Player(Player.Config(path=str(path), realtime=True)).run() if isinstance(m, Frame)]
     assert time.monotonic() - began >= played[-1].timestamp - played[0].timestamp > 0.0
@@ -99,6 +108,14 @@ def test_a_recording_is_made_once_and_played_at_its_pace(tmp_path: Path, monkeyp
     assert max(due) - min(due) < 0.01
     assert abs(played[0].captured - time.time()) < 60.0
     assert all(m.captured == 0.0 for m in Player(Player.Config(path=str(path))).run())
+
+
+def test_a_recording_of_another_size_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for width in (32, 48):
+        given = {"name": "synthetic", "size": [24, width], "options": {"frames": 2}}
+        monkeypatch.setitem(SCENES, "tiny", given)
+        played = Player(Player.Config(path=str(recording("tiny", tmp_path)))).run()
+        assert {m.image.shape[1] for m in played if isinstance(m, Frame)} == {width}
 
 
 def test_a_slow_stage_takes_that_many_times_as_long(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,4 +20,4 @@ def test_a_video_whose_data_is_not_there_is_said(benchmark: object, monkeypatch:
     monkeypatch.setattr(benchmark, "STRAIGHT", MISSING["walk"], raising=False)
     rows = benchmark.measure(argparse.Namespace(quick=False, scenes=None))  # type: ignore[attr-defined]
     (row,) = [row for row in rows if row.name == "walk: skipped"]
-    assert str(row.value).endswith("nowhere is not there")
+    assert str(row.value).endswith("nowhere is missing")

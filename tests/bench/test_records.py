@@ -181,6 +181,9 @@ def test_the_figures_name_rows_that_are_recorded_and_benchmarks_that_print_them(
     assert "COLMAP got 100 of the frames at 512x384" in protocol
     assert all("100 frames at 240x180" in line and " at 512x384" in line for line in of_colmap)
     assert sum(line.startswith("| Processor time ") for line in of_colmap) == 2
+    kept = {"name": "room, 320x240: completeness", "value": 0.5}
+    changed = figures.markdown(lambda name: [*record.Record.load(name).rows, kept])
+    assert "kept pixels within 2 %, at 0.50 of completeness" in changed
     with pytest.raises(KeyError, match="ATE"):
         figures.markdown(lambda name: [row("other", 1.0)])
     for name in {figure.benchmark for figure in figures.FIGURES}:

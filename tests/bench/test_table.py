@@ -10,7 +10,20 @@ from pathlib import Path
 import pytest
 
 from bench import curves
-from bench.table import Row, checked, failed, main, names, numbers, origin_of, timed
+from bench.table import (
+    Row,
+    at_least,
+    at_most,
+    checked,
+    failed,
+    is_skipped,
+    main,
+    names,
+    numbers,
+    origin_of,
+    skipped,
+    timed,
+)
 
 
 def ended(monkeypatch: pytest.MonkeyPatch, rows: list[Row], *words: str) -> int:
@@ -82,3 +95,18 @@ def test_no_number_meets_no_goal() -> None:
             assert row.met is False
             assert isinstance(row.value, float)
             assert math.isnan(row.value)
+
+
+def test_a_goal_that_follows_from_a_run_that_failed_is_met_by_nothing() -> None:
+    for value in (1.0, math.inf, math.nan):
+        assert at_most("a", value, "s", math.inf).met is False
+        assert at_least("a", -value, "s", -math.inf).met is False
+        assert at_most("a", value, "s", math.nan).met is False
+
+
+def test_what_is_left_out_is_said_and_known_again() -> None:
+    row = skipped("room", Path("/nowhere"))
+    assert (row.name, row.value) == ("room: skipped", "/nowhere is missing")
+    assert skipped("room, raft", "no weights").value == "no weights"
+    assert is_skipped(row.name)
+    assert not is_skipped("room: fraction skipped")

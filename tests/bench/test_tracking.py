@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import math
+import sys
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 
 from bench.baselines import colmap_poses
 from bench.baselines.colmap_poses import Model, load
+from bench.pieces import Kept
 from bench.tracking import baselines, curves, memory
+from bench.tracking.__main__ import Result, rows_of
 from bench.tracking.baselines import Baseline
+from bench.tracking.cases import Case
 from bench.tracking.curves import Point
 from bench.tracking.memory import Sample
 from mvsgs_core.datasets import Item
@@ -69,7 +75,8 @@ def test_colmap_is_a_mark_only_where_it_registers_most_frames(registered: int, g
     theirs[0, :3, 3] += 0.1
     ours[0, :3, 3] += 0.05
     ours[3] = np.nan
-    model = Model(np.arange(registered), 2.0 * theirs, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), {}, 30.0)
+    none = np.zeros((0, 3), np.uint8)
+    model = Model(np.arange(registered), 2.0 * theirs, none, none, {}, 35.0, solving_seconds=30.0)
     nothing = np.zeros(20)
     path = Trajectory(
         np.arange(20), nothing, ours, np.ones(20, bool), nothing.astype(np.uint8), nothing.astype(np.int32)
@@ -91,13 +98,48 @@ def test_colmaps_model_is_kept_for_the_same_images_only(tmp_path: Path, monkeypa
     ) -> tuple[Model, str]:
         calls.append(len(frames))
         np.savez(folder / "model.npz", index=np.arange(2), world_from_cam=np.zeros((2, 4, 4)), points=0, colors=0)
-        (folder / "seconds.json").write_text('{"wall": {"matching": 1.0}, "processor": 2.0}')
+        (folder / "seconds.json").write_text('{"wall": {"matching": 1.0}, "processor": 2.0, "solving": 1.5}')
         return load(folder), ""
 
     monkeypatch.setattr(colmap_poses, "reconstruct", fake)
     items, _ = moving(5)
     for used in (items, items, items[:4]):
-        baseline = baselines.solve(used, tmp_path, 1)
+        baseline = baselines.solve(used, tmp_path, 1, Kept(True))
         assert baseline.model is not None
-        assert baseline.model.processor_seconds == 2.0
+        assert (baseline.model.processor_seconds, baseline.model.solving_seconds) == (2.0, 1.5)
     assert calls == [5, 4]
+    baselines.solve(items[:4], tmp_path, 2, Kept(True))  # more threads take more time of the processor
+    baselines.solve(items[:4], tmp_path, 2, Kept(False))
+    assert calls == [5, 4, 4, 4]
+
+
+def test_colmap_s_time_is_without_its_start_and_without_reading(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "camera.json").write_text('{"size": [4, 4], "intrinsics": [1, 1, 1, 1]}')
+    program = MagicMock()
+    model = MagicMock(images={}, points3D={}, cameras={1: MagicMock()})
+    model.num_reg_images.return_value = 0
+    program.incremental_mapping.return_value = {0: model}
+    monkeypatch.setitem(sys.modules, "pycolmap", program)
+    monkeypatch.setattr(colmap_poses, "reading_seconds", lambda images: 100.0)
+    colmap_poses.run(tmp_path, 1, photographs=False)
+    found = load(tmp_path)
+    assert found.processor_seconds > 0.0
+    assert found.solving_seconds == pytest.approx(-100.0, abs=0.5)
+
+
+@pytest.mark.parametrize("errors", [[0.1, math.nan], [math.nan, 0.1]])
+def test_a_segment_whose_error_is_not_known_meets_no_goal_and_is_said(errors: list[float]) -> None:
+    one = np.array([0, 0, 0, 1])
+    path = Trajectory(np.arange(4), 0.1 * one, np.tile(np.eye(4), (4, 1, 1)), one < 1, 0 * one, one)
+    result = Result(path, errors, errors, 1.0, {}, 0.0, 0.0, ["2 segments"])
+    assert math.isnan(result.worst)
+    assert math.isnan(result.worst_of_keyframes)
+    plain = {row.name: row for row in rows_of("x", Case("synthetic", goal="1.1"), [result])}
+    assert plain["x: ATE keyframes"].met is False
+    assert plain["x: segments without a known error"].value == 1
+    hard = {row.name: row for row in rows_of("x", Case("synthetic", hard=True), [result])}
+    assert hard["x: error over path, 2 segments"].met is False
+    known = Result(path, [0.1, 0.2], [0.3, 0.1], 1.0, {}, 0.0, 0.0, [])
+    assert (known.worst_of_keyframes, known.worst, known.unknown("x")) == (0.2, 0.3, [])

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from bench.baselines.colmap_poses import Model
+from bench.pieces import in_pieces
 from bench.table import Row, failed
-from bench.wide import apart, in_pieces
+from bench.wide import Solved, apart, beside
 
 
 def test_what_was_measured_is_kept_and_what_is_missing_named(tmp_path: Path) -> None:
@@ -59,3 +60,12 @@ def test_results_of_two_orders_are_compared_photograph_by_photograph() -> None:
     moved, _ = apart("a", first, Model(np.roll(order, 1), other, none, none, {}, 1.0, 510.0))
     assert float(moved.value) > 1.0
     assert apart("a", first, replace(first, index=np.arange(5, 12))) == []
+
+
+def test_both_times_are_from_images_in_memory_to_poses() -> None:
+    """COLMAP's process also starts, and reads the images."""
+    none = np.zeros((0, 3))
+    theirs = Model(np.arange(2), np.tile(np.eye(4), (2, 1, 1)), none, none, {}, 30.0, 500.0, solving_seconds=20.0)
+    rows = {row.name: row for row in beside("a", [], Solved([], 8.0), theirs, "")}
+    assert rows["a: processor time, COLMAP"].value == 20.0
+    assert rows["a: processor time over COLMAP's"].value == pytest.approx(0.4)
