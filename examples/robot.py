@@ -2,7 +2,7 @@
 
     python examples/robot.py --camera 0 --intrinsics 610 610 320 240
     python examples/robot.py --video walk.mp4
-    python examples/robot.py --dataset tum ../shared/data/tum_fr1_xyz
+    python examples/robot.py --dataset tum rgbd_dataset_freiburg1_xyz
     mvsgs dataset=robot dataset.path=tcp://127.0.0.1:5555
 
 With --ros2 it stands for a camera of ROS 2, as far as dataset=ros2 is concerned (pip install cyclonedds):

@@ -11,9 +11,9 @@ from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import OmegaConf, open_dict
 
-from launch.compose import CONF, choices_of, graph_of, parse
+from launch.compose import CONF, choice_of, choices_of, defaults_of, graph_of, parse
 from launch.graph import Graph
 from launch.jobs import Job
 from launch.refusal import GraphError
@@ -60,26 +60,15 @@ def _unchosen(job: Job, slot: str, conf: Path) -> bool:
     """Whether the slot is as config.yaml has it: nothing was said of it, not even a parameter."""
     if any(parse(text).key_or_group.partition(".")[0] == slot for text in job.overrides):
         return False
-    default = _defaults(conf).get(slot)
-    return default is not None and job.choices.get(slot) == default and job.config[slot] == _choice(slot, default, conf)
-
-
-def _defaults(conf: Path) -> dict[str, str]:
-    config = OmegaConf.load(conf / "config.yaml")
-    assert isinstance(config, DictConfig)
-    entries = [entry for entry in config.defaults if isinstance(entry, DictConfig)]
-    return {str(slot): str(choice) for entry in entries for slot, choice in entry.items()}
-
-
-def _choice(slot: str, choice: str, conf: Path) -> DictConfig:
-    content = OmegaConf.load(conf / slot / f"{choice}.yaml")
-    assert isinstance(content, DictConfig)
-    return content
+    default = defaults_of(conf).get(slot)
+    if default is None or job.choices.get(slot) != default:
+        return False
+    return bool(job.config[slot] == choice_of(slot, default, conf))
 
 
 def _with(job: Job, slot: str, advice: Advice, conf: Path) -> Job:
     config = deepcopy(job.config)
     with open_dict(config):
-        config[slot] = OmegaConf.merge(_choice(slot, advice.choice, conf), dict(advice.parameters))
+        config[slot] = OmegaConf.merge(choice_of(slot, advice.choice, conf), dict(advice.parameters))
     overrides = [*job.overrides, f"{slot}={advice.choice}"]
     return replace(job, config=config, overrides=overrides, choices={**job.choices, slot: advice.choice})

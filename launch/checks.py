@@ -95,6 +95,10 @@ def _check_device(slot: str, device: Any) -> None:
         return
     import torch  # takes a second to load
 
+    from mvsgs_core.devices import torch_refuses
+
     there, number = torch.cuda.device_count(), device.partition(":")[2] or "0"
     if not number.isdigit() or int(number) >= there:
         raise GraphError(f"{slot}.device={device}: this machine has {there} CUDA devices; use {slot}.device=cpu")
+    if refused := torch_refuses(device):
+        raise GraphError(f"{slot}.device={device}: {refused}; or use {slot}.device=cpu")

@@ -40,7 +40,7 @@ def figures(reports: Sequence[Mapping[str, Any]]) -> list[Figure]:
     """Those that any of the runs has."""
     found = []
     for place, name in PARTS.items():
-        values = [_number(report, place) for report in reports]
+        values = [metrics.number(report, place) for report in reports]
         if any(value is not None for value in values):
             metric = metrics.at(place)
             found.append(Figure(f"{name}, {metric.unit}".removesuffix(", "), metric, values))
@@ -90,10 +90,3 @@ def finished_report(output: Path) -> dict[str, Any]:
     if not report.get("finished", True) or "rendering" not in report:
         raise ValueError(f"{output}: that run has no figures: {report.get('reason') or 'no evaluator scored it'}")
     return report
-
-
-def _number(report: Mapping[str, Any], place: str) -> float | None:
-    found: Any = report
-    for key in place.split("."):
-        found = found.get(key) if isinstance(found, Mapping) else None
-    return float(found) if isinstance(found, int | float) and not isinstance(found, bool) else None

@@ -81,7 +81,7 @@ def prepare(overrides: Sequence[str], conf: Path = CONF, *, all_choices_known: b
 
     `all_choices_known` is False where choices can come from other directories: Hydra refuses them then.
     """
-    choices = {slot: choices_of(slot, conf) for slot in slots_of(conf)}
+    choices = {slot: choices_of(slot, conf) for slot in defaults_of(conf)}
     overrides = [text if "refine" in choices else _spelled_out(text) for text in overrides]
     overrides = [*_implied(overrides, choices, conf), *overrides]
     return [_prepare(text, choices, parameter_names(Settings), all_choices_known) for text in overrides]
@@ -100,9 +100,8 @@ def _implied(overrides: Sequence[str], slots: Mapping[str, list[str]], conf: Pat
     found: dict[str, str] = {}
     for slot, override in given.items():
         if slot in slots and not override.is_sweep_override() and override.value() in slots[slot]:
-            content = OmegaConf.load(conf / slot / f"{override.value()}.yaml")
-            assert isinstance(content, DictConfig)
-            found |= {str(other): str(choice) for other, choice in (content.get("implies") or {}).items()}
+            implied = choice_of(slot, str(override.value()), conf).get("implies") or {}
+            found |= {str(other): str(choice) for other, choice in implied.items()}
     return [f"{slot}={choice}" for slot, choice in found.items() if slot not in given]
 
 
@@ -139,12 +138,20 @@ def choices_of(slot: str, conf: Path = CONF) -> list[str]:
     return sorted(path.stem for path in (conf / slot).glob("*.yaml"))
 
 
-def slots_of(conf: Path) -> list[str]:
-    """The slots that config.yaml names."""
+def choice_of(slot: str, choice: str, conf: Path = CONF) -> DictConfig:
+    """What the file of one of them says."""
+    content = OmegaConf.load(conf / slot / f"{choice}.yaml")
+    assert isinstance(content, DictConfig)
+    return content
+
+
+def defaults_of(conf: Path = CONF) -> dict[str, str]:
+    """The slots that config.yaml names, each with its choice there."""
     config = OmegaConf.load(conf / "config.yaml")
     assert isinstance(config, DictConfig)
-    groups = [str(next(iter(entry))) for entry in config.defaults if isinstance(entry, DictConfig)]
-    return [group for group in groups if not group.startswith("override ")]
+    entries = [entry for entry in config.defaults if isinstance(entry, DictConfig)]
+    found = {str(slot): str(choice) for entry in entries for slot, choice in entry.items()}
+    return {slot: choice for slot, choice in found.items() if not slot.startswith("override ")}
 
 
 def _replaced(config: DictConfig, overrides: Sequence[str]) -> dict[str, Replaced]:

@@ -30,11 +30,11 @@ class GlobalDevice:
         there = torch.cuda.device_count()
         if self.wanted != "auto" and int(self.wanted.partition(":")[2] or 0) >= there:
             raise GraphError(f"device={self.wanted}: this machine has {there} CUDA devices; use device=cpu")
-        lacking = lacks_for_gpu() if there else ""
+        lacking = lacks_for_gpu("cuda" if self.wanted == "auto" else self.wanted) if there else ""
         if self.wanted != "auto":
             if lacking:
                 raise GraphError(f"device={self.wanted}: {lacking}; or use device=cpu")
             return self.wanted
         if lacking:
             self.warnings.append(f"the GPU is not used: {lacking}")
-        return "cuda" if torch.cuda.is_available() and not lacking else "cpu"
+        return "cuda" if there and not lacking else "cpu"

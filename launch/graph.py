@@ -17,7 +17,6 @@ import msgs
 import nodes
 from launch.global_device import GlobalDevice
 from launch.refusal import GraphError
-from launch.renamed_parameters import refuse_old_names
 from launch.requests import MESSAGES as REQUESTS
 from launch.requests import asker
 from launch.settings import BUFFER, FROM_SETTINGS, LIVE_BUFFER, Settings
@@ -191,7 +190,6 @@ def _build_slot(
         kept = {*replaced.given, *(key for key in replaced.interpolated if key in accepted)}
         given = {key: value for key, value in given.items() if key in kept}
         reads = {key: value for key, value in reads.items() if key in {t.__name__ for t in inputs}}
-    refuse_old_names(name, node.Config, given)
     given = {key: getattr(settings, key) for key in FROM_SETTINGS if key in accepted} | given
     built = build(node.Config, given, name)
     parameters = plain_values(built) | _completed(name, node, built)

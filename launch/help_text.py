@@ -1,4 +1,4 @@
-"""`run_all.py --help`: slots, choices and every parameter of what a command line composes, read from the source.
+"""`mvsgs --help ...`: slots, choices and every parameter of what a command line composes, read from the source.
 
 Type, default and the comment beside the field stand in the dataclass alone; the first lines of a choice's file say what
 the choice is.
@@ -22,21 +22,23 @@ from nodes.parameters import Parameter, parameters, plain_values, type_name
 HEADER = """\
 Maps a video, a photo sequence or a live camera with Gaussian splats.
 
-  python launch/run_all.py                                   the synthetic room
-  python launch/run_all.py walk.mp4                          a video, a folder of images, a data set, by what it is
-  python launch/run_all.py dataset=tum dataset.path=DIR      a TUM RGB-D sequence
-  python launch/run_all.py camera viewer=viser               a camera, live; Ctrl-C ends the stream, not the map
-  python launch/run_all.py resume=DIR                        goes on with an interrupted run, in its directory
-  python launch/run_all.py dataset=camera map=DIR            goes on in the map of a run with keep_map=true
-  python launch/run_all.py dataset=camera map=DIR mapper=frozen  only finds the camera in it
-  python launch/run_all.py -m mapper.iterations=100,300      a sweep
-  python launch/run_all.py -m hydra/launcher=submitit_slurm mapper.iterations=100,300    the same on a Slurm cluster
-  python launch/run_all.py refine=ray refine.address=HOST:6379  refines the map on a Ray cluster's machines
-  python launch/run_all.py --inline                          everything in one process, for a debugger
-  python launch/run_all.py --graph mapper=paper              shows the graph of any command line, and runs nothing
-  python launch/run_all.py --help mapper=paper               this, for what that command line composes
-  python launch/run_all.py tracker._target_=my_tracker.Mine  a node of your own, from a file in this directory
-  python launch/run_all.py tracker=external                  prints how to run that node by hand, elsewhere
+  mvsgs demo                                   the synthetic room
+  mvsgs walk.mp4                               a video, a folder of images, a data set, by what it is
+  mvsgs dataset=tum dataset.path=DIR           a TUM RGB-D sequence
+  mvsgs camera viewer=viser                    a camera, live; Ctrl-C ends the stream, not the map
+  mvsgs resume=DIR                             goes on with an interrupted run, in its directory
+  mvsgs dataset=camera map=DIR                 goes on in the map of a run with keep_map=true
+  mvsgs dataset=camera map=DIR mapper=frozen   only finds the camera in it
+  mvsgs -m mapper.iterations=100,300           a sweep
+  mvsgs -m hydra/launcher=submitit_slurm mapper.iterations=100,300    the same on a Slurm cluster
+  mvsgs refine=ray refine.address=HOST:6379    refines the map on a Ray cluster's machines
+  mvsgs --inline                               everything in one process, for a debugger
+  mvsgs --graph mapper=paper                   shows the graph of any command line, and runs nothing
+  mvsgs --help mapper=paper                    this, for what that command line composes
+  mvsgs tracker._target_=my_tracker.Mine       a node of your own, from a file in this directory
+  mvsgs tracker=external                       prints how to run that node by hand, elsewhere
+
+In a checkout `python launch/run_all.py ...` is the same as `mvsgs run ...`.
 """
 EDGES = 'Edges: <slot>.reads.<Message>=<slot that sends it>; with "?" after it: newest only, never slows the sender.'
 COMMENT_COLUMN = 44

@@ -5,20 +5,16 @@ For debuggers, for tests, and for programs that map by themselves (mvsgs/mapping
 
 from __future__ import annotations
 
-import random
 import resource
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
-
-import numpy as np
 
 import nodes
 from launch.graph import Graph
 from msgs import End, Message
 from nodes.runtime.requests import Pause
-from nodes.runtime.runner import Runner, end_of
+from nodes.runtime.runner import Runner, end_of, seed
 
 POLL = 0.05  # s between two looks at what is asked, while the stream waits
 Observer = Callable[[str, nodes.Node, Any], None]
@@ -31,7 +27,7 @@ def run_inline(graph: Graph, observe: Observer | None = None) -> dict[str, nodes
     each message. `observe(slot, node, message)` sees every message sent. An exception in a node passes through, after
     every node's `on_abort`.
     """
-    _seed(graph.settings.seed)
+    seed(graph.settings.seed)
     run = InlineGraph(graph, observe)
     try:
         run.run_sources()
@@ -113,10 +109,3 @@ class InlineGraph:
     def _end(self, name: str, runner: Runner) -> End:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024  # of all nodes together, here
         return end_of(name, runner.node, peak_bytes=peak, busy_seconds=runner.busy_seconds)
-
-
-def _seed(seed: int) -> None:
-    random.seed(seed)
-    np.random.seed(seed)
-    if "torch" in sys.modules:
-        sys.modules["torch"].manual_seed(seed)

@@ -9,8 +9,9 @@ import msgs
 from launch.graph import Graph, Slot
 from mvsgs_core.machine import available_cores
 
-# Share of the cores by work per keyframe; a slot that is not named counts as 1.
+# Share of the cores by work per keyframe; a slot that is not named counts as 1, one that works on a GPU as ON_GPU.
 SHARES: Mapping[str, float] = {"mapper": 4, "mvs": 3, "tracker": 2, "depth_fusion": 1, "dataset": 0.5}
+ON_GPU = 0.5
 # Works only when the others have finished: all cores are its own by then.
 LAST = ("evaluator",)
 # The heaviest slot takes most of a whole run's CPU time (the mapper 76 to 94 % of it, measured on the synthetic room
@@ -27,16 +28,22 @@ def thread_plan(graph: Graph, cores: int | None = None) -> dict[str, int]:
     The sum may exceed the cores a little, because waiting threads sleep.
     """
     cores = available_cores() if cores is None else cores
-    total = sum(SHARES.get(name, 1) for name in graph.slots if name not in LAST)
-    heaviest = max(graph.slots, key=lambda name: SHARES.get(name, 1))
+    shares = {name: ON_GPU if _on_gpu(slot) else SHARES.get(name, 1) for name, slot in graph.slots.items()}
+    total = sum(share for name, share in shares.items() if name not in LAST)
+    on_cpu = [name for name, slot in graph.slots.items() if not _on_gpu(slot)]
+    heaviest = max(on_cpu, key=shares.__getitem__, default="")
     plan = {}
     for name, slot in graph.slots.items():
-        share = cores if name in LAST else max(1, round(cores * SHARES.get(name, 1) / total))
+        share = cores if name in LAST else max(1, round(cores * shares[name] / total))
         if name == heaviest:
             share = max(share, math.ceil(cores * HEAVIEST_SHARE))
         pinned = len(slot.placement.cpu) if slot.placement.cpu else share
         plan[name] = own_threads(slot) or min(share, pinned)
     return plan
+
+
+def _on_gpu(slot: Slot) -> bool:
+    return str(slot.config.get("device")).startswith("cuda")
 
 
 def own_threads(slot: Slot) -> int | None:

@@ -6,7 +6,7 @@ Where they cannot (a live camera), the checkpoint's keyframes are the source, an
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,10 @@ from yaml import YAMLError  # type: ignore[import-untyped]
 
 import msgs
 import nodes
-from launch.compose import CONF, graph_of, parse, prepare, slots_of
+from launch.compose import CONF, choice_of, defaults_of, graph_of, parse, prepare
 from launch.graph import load_node
 from launch.output import REPORT, read_report
 from launch.refusal import GraphError
-from launch.renamed_parameters import refuse_old_names
 from launch.settings import BUFFER, FROM_SETTINGS, LIVE_BUFFER
 from mvsgs_core.mapping.checkpoints.files import CheckpointInfo, checkpoint_info
 from nodes.parameters import parameter_names
@@ -38,9 +37,8 @@ def resumed_config(folder: Path, overrides: Sequence[str], conf: Path = CONF) ->
     """
     folder = folder.expanduser().absolute()
     config = _moved(_interrupted(folder), folder)
-    _refuse_older(config, folder)
     info = _checkpoint(folder)
-    slots = slots_of(conf)
+    slots = defaults_of(conf)
     for text in sorted(prepare(overrides, conf), key=_of_one_slot):
         _apply(config, text, slots, conf)
     if not all(node.replayable for node in _classes(config).values() if nodes.is_source(node)):
@@ -117,14 +115,6 @@ def _moved(config: DictConfig, folder: Path) -> DictConfig:
     return found
 
 
-def _refuse_older(config: DictConfig, folder: Path) -> None:
-    for slot, node in _classes(config).items():
-        try:
-            refuse_old_names(slot, node.Config, config[slot])
-        except GraphError as error:
-            raise GraphError(f"{WORD}{folder}: that run was one of an older version: {error}") from None
-
-
 def _checkpoint(folder: Path) -> CheckpointInfo:
     try:
         return checkpoint_info(folder)
@@ -132,14 +122,14 @@ def _checkpoint(folder: Path) -> CheckpointInfo:
         raise GraphError(f"{WORD}{folder}: {error}") from error
 
 
-def _apply(config: DictConfig, text: str, slots: Sequence[str], conf: Path) -> None:
+def _apply(config: DictConfig, text: str, slots: Collection[str], conf: Path) -> None:
     """One override: another choice for a slot, or a value."""
     override = parse(text.lstrip("+"))
     if override.type is not OverrideType.CHANGE or override.is_sweep_override():
         raise GraphError(f"{text}: with {WORD}DIR only slot=choice and slot.parameter=value")
     key, value = override.key_or_group, override.value()
     if key in slots:
-        config[key] = OmegaConf.load(conf / key / f"{value}.yaml")
+        config[key] = choice_of(key, str(value), conf)
     elif key == "output":
         raise GraphError(f"{text}: a run is resumed in its own directory")
     else:
@@ -174,7 +164,7 @@ def _classes(config: DictConfig) -> dict[str, type[nodes.Node]]:
 
 def _without_stream(config: DictConfig, folder: Path, conf: Path) -> None:
     """The checkpoint's keyframes in the sources' place; the stages up to the mapper are off."""
-    config[SOURCE] = OmegaConf.load(conf / SOURCE / f"{CHOICE}.yaml")
+    config[SOURCE] = choice_of(SOURCE, CHOICE, conf)
     config[SOURCE].path = str(folder)
     classes = _classes(config)
     given = {message.__name__ for message in nodes.outputs(classes[SOURCE])}

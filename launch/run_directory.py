@@ -13,9 +13,9 @@ from pathlib import Path
 from launch.graph import Graph
 from launch.refusal import GraphError
 from launch.specs import topic_of
+from nodes.runtime.addresses import IPC_PATH_BYTES
 from nodes.runtime.spec import gone_file
 
-LONGEST_SOCKET_PATH = 107  # bytes that a Unix socket's address holds
 PREFIX = "mvsgs-"
 LOCK = "launcher.lock"  # held by the run's launcher as long as it lives
 
@@ -76,9 +76,9 @@ def base_directory(graph: Graph) -> Path:
     topics = [topic_of(edge) for edge in graph.edges] if graph.settings.transport == "ipc" else []
     longest = max(map(len, topics), default=0)
     for base in _bases():
-        if len(os.fsencode(base)) + len(f"/{PREFIX}12345678/") + longest <= LONGEST_SOCKET_PATH:
+        if len(os.fsencode(base)) + len(f"/{PREFIX}12345678/") + longest <= IPC_PATH_BYTES:
             return base
     raise GraphError(
-        f"the path of a socket in {tempfile.gettempdir()} would be longer than {LONGEST_SOCKET_PATH} bytes: "
+        f"the path of a socket in {tempfile.gettempdir()} would be longer than {IPC_PATH_BYTES} bytes: "
         "set TMPDIR to a shorter one, or transport=tcp"
     )

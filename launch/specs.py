@@ -11,9 +11,7 @@ from launch.graph import Edge, Graph
 from launch.placement import niceness
 from launch.ports import free_ports
 from launch.refusal import GraphError
-from nodes.runtime.addresses import TransportError, load_keys
-
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
+from nodes.runtime.addresses import TransportError, is_loopback, load_keys
 
 
 def check_addresses(graph: Graph) -> None:
@@ -29,7 +27,7 @@ def check_addresses(graph: Graph) -> None:
     topics = _topics(graph)
     for topic in topics:
         host = _host(graph, topic)
-        if host not in LOOPBACK and settings.keys is None:
+        if settings.keys is None and not is_loopback(host):
             raise GraphError(
                 f"{topic} at {host}: beyond loopback only with keys=DIR (CURVE keys), which docs/guides/node.md says "
                 "how to make"

@@ -28,7 +28,6 @@ class NodeStatus:
     values: dict[str, Any] = field(default_factory=dict)
     skipped: dict[str, float] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
-    cpu_seconds: float = 0.0
     memory: float = 0.0  # resident, bytes
     error: str | None = None
     traceback: str | None = None

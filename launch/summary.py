@@ -8,16 +8,17 @@ from pathlib import Path
 from typing import Any
 
 from mvsgs_core.evaluation import metrics
+from mvsgs_core.evaluation.metrics import value
 
 FILES = ("report.html", "report.json", "map.ply", "cameras.json", "transforms.json", "keyframes", "trajectory.txt",
-         "georeference.json", "config.yaml", "logs")  # fmt: skip
+         "localization.csv", "comparison.png", "georeference.json", "config.yaml", "logs")  # fmt: skip
 
 
 def summary(output: Path) -> str:
     """What the run reached and where its files are."""
     report = json.loads((output / "report.json").read_text())
     figures = _figures(report)
-    lines = ["", *figures, *(f"{node:11} {text}" for node, text in (_get(report, "cut_off") or {}).items())]
+    lines = ["", *figures, *(f"{node:11} {text}" for node, text in (value(report, "cut_off") or {}).items())]
     if not report.get("finished", True):
         lines.append(f"no report: {report.get('reason')}")
     elif not figures:
@@ -29,14 +30,14 @@ def summary(output: Path) -> str:
 def _figures(report: Mapping[str, Any]) -> list[str]:
     lines = []
     for part, title in (("keyframes", "keyframes"), ("held_out", "held-out ")):
-        after = _image(_get(report, "rendering", part))
-        before = _image(_get(report, "rendering_before_refinement", part))
+        after = _image(value(report, f"rendering.{part}"))
+        before = _image(value(report, f"rendering_before_refinement.{part}"))
         if after or before:
             lines.append(f"{title}   {after or '-'}" + (f"   (before refinement: {before})" if before else ""))
-    if fitted := _image(_get(report, "rendering", "held_out_fitted")):
+    if fitted := _image(value(report, "rendering.held_out_fitted")):
         lines.append(f"  fitted    {fitted}, their poses and exposures fitted at test time")
     lines += _worst(report, "rendering") or _worst(report, "rendering_before_refinement")
-    trajectory = _get(report, "trajectory") or {}
+    trajectory = value(report, "trajectory") or {}
     if trajectory:
         ate, number = metrics.listed(metrics.TRAJECTORY[:1], trajectory), f"{trajectory.get('ate_keyframes')} keyframes"
         if not ate:  # too few of them have a true pose
@@ -46,24 +47,24 @@ def _figures(report: Mapping[str, Any]) -> list[str]:
             f"trajectory  {trajectory.get('frames_tracked')} of {trajectory.get('frames')} frames, "
             f"{trajectory.get('keyframes')} keyframes" + (f", {ate} {behind}" if ate else "")
         )
-    if place := _get(report, "georeference"):
+    if place := value(report, "georeference"):
         sure = f"unit {100 * place['scale_deviation']:.2g} %, orientation {place['angle_deviation']:.2g} degrees"
         lines.append(
             f"GPS         {place['residual']:.2f} m from {place['positions']} positions (median), {place['outliers']} "
             f"outliers; sure to {sure}; metres: mvsgs export RUN OUT --frame enu"
         )
-    depth = _get(report, "depth") or {}
+    depth = value(report, "depth") or {}
     if errors := metrics.listed(metrics.DEPTH, depth):
         lines.append(f"depth       {errors}, {depth.get('count')} keyframes")
-    splats = _get(report, "map", "splats")  # without an evaluator the map is a word, not figures
+    splats = value(report, "map.splats")  # without an evaluator the map is a word, not figures
     if splats is not None:
-        lines.append(f"map         {splats} splats, {metrics.at('map.bytes').text(_get(report, 'map', 'bytes'))}")
-    times = _get(report, "time") or {}
+        lines.append(f"map         {splats} splats, {metrics.at('map.bytes').text(value(report, 'map.bytes'))}")
+    times = value(report, "time") or {}
     if times.get("wall") is not None:
         wall, pace = metrics.at("time.wall"), metrics.at("time.keyframes_per_second")
         rate = pace.text(times.get(pace.key), unit=False)
         lines.append(f"time        {wall.text(times['wall'])}, {rate} keyframes/s")
-    for by_name in (_get(report, "latency") or {}).values():
+    for by_name in (value(report, "latency") or {}).values():
         for what, found in by_name.items():
             median, p99 = 1e3 * found.get("median", 0.0), 1e3 * found.get("p99", 0.0)
             lines.append(f"latency     {what}: {median:.0f} ms, 99 %: {p99:.0f} ms ({found.get('count')})")
@@ -77,7 +78,7 @@ def _image(scores: Mapping[str, Any] | None) -> str:
 
 def _worst(report: Mapping[str, Any], part: str) -> list[str]:
     """The worst of all frames that were scored, and the one that the map covers least."""
-    worst, coverage = _get(report, part, "worst", "all"), _get(report, part, "coverage")
+    worst, coverage = value(report, f"{part}.worst.all"), value(report, f"{part}.coverage")
     if not worst or not coverage or coverage.get("min") is None:
         return []
     figure = metrics.listed(metrics.IMAGE[:1], worst)
@@ -85,10 +86,3 @@ def _worst(report: Mapping[str, Any], part: str) -> list[str]:
         f"worst       frame {worst.get('index')} ({worst.get('kind')}){figure and f': {figure}'}; least covered: "
         f"frame {coverage.get('min_index')}, {100 * coverage['min']:.1f} % (of {coverage.get('count')} frames)"
     ]
-
-
-def _get(report: Mapping[str, Any], *path: str) -> Any:
-    found: Any = report
-    for key in path:
-        found = found.get(key) if isinstance(found, Mapping) else None
-    return found

@@ -36,7 +36,7 @@ def check_launcher(words: Sequence[str]) -> None:
     """Raises GraphError for a sweep on a Slurm cluster without what hands its jobs on."""
     for word in words:
         if word.startswith("hydra/launcher=submitit") and importlib.util.find_spec(SUBMITIT) is None:
-            raise GraphError(f"{word} needs Hydra's launcher for Slurm: pip install 'mvsgs[slurm]'")
+            raise GraphError(f"{word} needs Hydra's launcher for Slurm: pip install 'hydra-submitit-launcher>=1.2'")
         if word == "hydra/launcher=submitit_slurm" and shutil.which("srun") is None:
             raise GraphError(f"{word}: Slurm's srun is not on this machine; hydra/launcher=submitit_local does without")
 

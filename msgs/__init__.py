@@ -91,6 +91,8 @@ class Frame(_Image):
     exposure: float = 0.0  # exposure time times gain over f-number², in a unit that the stream keeps; 0: not known
     # by GPS: latitude, longitude (degrees, WGS84), altitude (m)
     place: Annotated[np.ndarray, "float64 3"] | None = field(default=None, kw_only=True)
+    # fx, fy, cx, cy of the image as the camera took it, before its undistortion and scaling; None: of this image
+    original_intrinsics: Annotated[np.ndarray, "float64 4"] | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True)

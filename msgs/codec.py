@@ -80,15 +80,14 @@ def encode(
     *,
     before: Mapping[str, int] | None = None,
     delivery: bytes = RELIABLE,
-    max_bytes: int | None = None,
     allocate: Callable[[int], np.ndarray] = _allocate,
 ) -> memoryview:
     """The message as one frame, in memory of which `allocate(n)` gives at least n bytes (uint8, contiguous).
 
     before: how many messages of each other type the sender has sent so far, by which a reader of several of its topics
     keeps their order.
-    Raises CodecError where a field differs from its annotation or the frame would be larger than `max_bytes` (None:
-    `max_message_bytes` of its type).
+    Raises CodecError where a field differs from its annotation or the frame would be larger than `max_message_bytes`
+    of its type.
     """
     name = type(message).__name__
     specs = _SPECS.get(name)
@@ -127,7 +126,7 @@ def encode(
     except (ValueError, OverflowError, TypeError) as error:
         raise CodecError(f"{name}: {error}") from error
     limit = _header_limit(name)
-    max_bytes = max_message_bytes(type(message)) if max_bytes is None else max_bytes
+    max_bytes = max_message_bytes(type(message))
     header_at = _PREFIX.size + len(name)
     header_end = header_at + len(header)
     section = _aligned(header_end)
@@ -150,7 +149,7 @@ def encode(
     return frame
 
 
-def decode(frame: Any, *, expect: tuple[type, ...] | None = None, max_bytes: int | None = None) -> Decoded:
+def decode(frame: Any, *, expect: tuple[type, ...] | None = None) -> Decoded:
     """The message of a frame (any bytes-like object). Its arrays are read-only; those over `SMALL_BYTES` are views that
     keep the frame alive.
 
@@ -162,7 +161,7 @@ def decode(frame: Any, *, expect: tuple[type, ...] | None = None, max_bytes: int
     message_type = msgs.TYPES.get(name)
     if message_type is None or message_type not in allowed:
         raise CodecError(f"a frame of type {name!r} where {' or '.join(t.__name__ for t in allowed)} is expected")
-    max_bytes = max_message_bytes(message_type) if max_bytes is None else max_bytes
+    max_bytes = max_message_bytes(message_type)
     if view.nbytes > max_bytes:
         raise CodecError(f"a frame of {view.nbytes} bytes, more than the {max_bytes} that a {name} may have")
     sequence, scalars, arrays, before = _unpack_header(header, name)
@@ -199,7 +198,7 @@ def type_name(frame: Any) -> str:
 
 
 def max_message_bytes(message_type: type) -> int:
-    """The largest frame of a type unless a topic sets another limit."""
+    """The largest frame of a type."""
     return MAX_MAP_BYTES if message_type is msgs.SplatMap else MAX_MESSAGE_BYTES
 
 

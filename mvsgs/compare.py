@@ -6,13 +6,14 @@ import argparse
 from pathlib import Path
 
 from launch.comparison import comparison_page, comparison_text
+from mvsgs.evaluate import output_of
 from mvsgs_core.atomic_file import replace_text
 from mvsgs_core.export.command_line import run
 
 
 def compare(options: argparse.Namespace) -> str:
     """Does what the command line asks. Raises ValueError and OSError."""
-    outputs = [path.parent if path.is_file() else path for path in options.runs]
+    outputs = [output_of(path) for path in options.runs]
     if len(outputs) < 2:
         raise ValueError("give two runs or more: their output folders")
     if len({output.resolve() for output in outputs}) < len(outputs):

@@ -20,7 +20,7 @@ import torch
 from launch.named_input import quoted
 from mvsgs import WORKSPACE
 from mvsgs_core import machine, native, weights
-from mvsgs_core.devices import lacks_for_gpu
+from mvsgs_core.devices import lacks_for_gpu, torch_refuses
 from mvsgs_core.named_modules import is_installed
 
 KERNELS = ("rasterizer", "mapping", "tracking", "mvs", "fusion", "scene")
@@ -99,6 +99,8 @@ def _kernels() -> Iterator[tuple[str, str, bool]]:
 
 def _gpu() -> tuple[str, bool]:
     names = machine.gpus()
+    if not names and (refused := torch_refuses()):
+        return f"not used: {refused}", True
     if not names:
         built = "PyTorch sees none" if torch.version.cuda else "this PyTorch is built for processors alone"
         return f"none: {built}; runs use the processor", True

@@ -59,7 +59,8 @@ class Frames:
         self._count, self._last = index + 1, seconds
         if seen is not None:
             seen = self._framing.mask(seen, lens, self._framing.size_of(size))
-        frame = Frame(index, seconds, shown, focal, lens.guessed, mask=seen)
+        original = np.array(lens.intrinsics, np.float64)
+        frame = Frame(index, seconds, shown, focal, lens.guessed, mask=seen, original_intrinsics=original)
         return frame, GroundTruth(index, seconds, shown, focal, world_from_cam, None, mask=seen)
 
     def _lens(self, size: tuple[int, int], intrinsics: Numbers | None) -> Lens:

@@ -19,13 +19,12 @@ from mvsgs_core.export.mesh import write_mesh
 from mvsgs_core.export.ply import write_ply
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.export.source_camera import SourceCamera
-from mvsgs_core.export.splat import write_splat, write_spz
+from mvsgs_core.export.splat import WRITERS
 from mvsgs_core.export.transforms import write_transforms
 from mvsgs_core.mapping.keyframe_checks import is_pose
-from mvsgs_core.mapping.preview import as_bytes
+from mvsgs_core.rasterizer.interface import as_bytes
 
 CAMERAS = "cameras.json"
-SPLATS = {".splat": write_splat, ".spz": write_spz}
 MESHES = (".glb", ".obj", ".stl", ".off")
 
 
@@ -104,8 +103,8 @@ class GaussianMap:
             raise ValueError(f"{out} is what this map was loaded from: give another file")
         if out.suffix == ".ply":
             write_ply(out, self.snapshot, fold=fold)
-        elif out.suffix in SPLATS:
-            SPLATS[out.suffix](out, self.snapshot)
+        elif out.suffix in WRITERS:
+            WRITERS[out.suffix](out, self.snapshot)
         elif out.suffix in MESHES:
             write_mesh(out, self.snapshot, self._keyframes(out), voxel)
         elif out.name == CAMERAS:
@@ -119,7 +118,7 @@ class GaussianMap:
             given = None if images is None else Path(images)
             write_colmap(out, self.snapshot, self._keyframes(out), given, observations)
         else:
-            there = ", ".join((".ply", *SPLATS, *MESHES, ".json"))
+            there = ", ".join((".ply", *WRITERS, *MESHES, ".json"))
             raise ValueError(f"{out}: no format {out.suffix!r}; there are: {there}, a folder")
         return out
 

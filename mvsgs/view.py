@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 import viser
 
 from mvsgs.view_tools import Cropping, Exporting, Flight, Measuring
@@ -25,8 +24,8 @@ from mvsgs_core.export.command_line import input_arguments, known_cameras, read_
 from mvsgs_core.export.keyframe_render import rendered_keyframe
 from mvsgs_core.export.ply import folded
 from mvsgs_core.export.snapshot import Snapshot
-from mvsgs_core.mapping.preview import as_bytes, covariances
-from mvsgs_core.rasterizer.spherical_harmonics import C0
+from mvsgs_core.mapping.preview import gaussian_arrays, known_depth
+from mvsgs_core.rasterizer.interface import as_bytes
 from nodes.keyframe_pictures import KeyframePictures, depth_points, difference, pictures
 from nodes.map_page import MapPage, check_address, escaped
 from nodes.page_guard import check_names
@@ -68,10 +67,7 @@ class SavedMapView:
 
     def _show_splats(self, final: Snapshot) -> int:
         splats = folded(final.splats, final.kernel)  # browsers know only Gaussians
-        return self.page.show_splats(
-            splats.means.numpy(), covariances(splats.quaternions, splats.log_scales, 1.0).numpy(),
-            as_bytes(0.5 + C0 * splats.sh[:, 0]), torch.sigmoid(splats.opacity_logits).numpy(),
-        )  # fmt: skip
+        return self.page.show_splats(**gaussian_arrays(splats))
 
     def _add_tools(self) -> None:
         rotations = self._poses[:, :3, :3] if len(self._poses) else np.eye(3)[None]
@@ -129,7 +125,7 @@ class SavedMapView:
     def _rendered(self, cameras: Cameras, k: int) -> tuple[np.ndarray, np.ndarray]:
         """(H, W, 3) uint8 and the depth (H, W), 0 where the map covers less than half of a pixel."""
         color, render = rendered_keyframe(self._left, cameras, k)
-        return as_bytes(color), torch.where(render.opacity > 0.5, render.depth, 0.0).numpy()
+        return as_bytes(color), known_depth(render).numpy()
 
     def tint(self, figure: str) -> None:
         """Colors all keyframes by "coverage", or by the "error" of those with a photograph; or by "nothing"."""

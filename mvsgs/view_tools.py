@@ -21,7 +21,7 @@ from mvsgs_core.export.picking import Box, Ruler, hit, kept
 from mvsgs_core.export.ply import write_ply
 from mvsgs_core.export.render_path import frames_along, resampled
 from mvsgs_core.export.snapshot import Snapshot
-from mvsgs_core.export.splat import write_splat, write_spz
+from mvsgs_core.export.splat import WRITERS
 from mvsgs_core.geometry import rotation_from_quaternion
 from mvsgs_core.video_file import write_video
 from nodes.map_page import MapPage, escaped
@@ -29,8 +29,7 @@ from nodes.map_page import MapPage, escaped
 _LINE = (230, 90, 40)
 FPS = 30.0
 VOXEL = 0.01  # of the mesh, in median depths
-SPLATS = {".splat": write_splat, ".spz": write_spz}
-FORMATS = (".ply", *SPLATS, ".glb")
+FORMATS = (".ply", *WRITERS, ".glb")
 AXES = ("left to right", "front to back", "bottom to top")
 
 
@@ -229,8 +228,8 @@ class Exporting:
             write_mesh(file, final, Cameras(**{**vars(self._cameras), "world_from_cam": poses}), VOXEL)
         elif file.suffix == ".ply":
             write_ply(file, final, fold=True)
-        elif file.suffix in SPLATS:
-            SPLATS[file.suffix](file, final)
+        elif file.suffix in WRITERS:
+            WRITERS[file.suffix](file, final)
         else:
             raise ValueError(f"no format {file.suffix!r} here")
 

@@ -8,5 +8,9 @@ HELD_OUT_EVERY = 5  # frames
 
 
 def is_held_out(index: int) -> bool:
-    """Whether the frame of this index of the stream (from 0) is kept out of the map."""
-    return index % HELD_OUT_EVERY == 0
+    """Whether the frame of this index of the stream (from 0) is kept out of the map.
+
+    The first frame never is: it's the first view that a user gives, and no frame before it shows what only it sees.
+    Nor is a frame of an earlier stream (below 0, kept_map.py), of which nothing is scored.
+    """
+    return index > 0 and index % HELD_OUT_EVERY == 0

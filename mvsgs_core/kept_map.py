@@ -4,7 +4,7 @@
     DIR/checkpoint/tracker.npz               the tracker's half: keyframes as it tracks them, see tracking/known_map.py
 
 Frames are numbered from 0 in every stream. On a new stream the frames of the map's own are numbered from -`STREAM` on,
-those of the stream before that from -2 `STREAM`: so they come before all new ones, and held-out frames stay those.
+those of the stream before that from -2 `STREAM`: so they come before all new ones, and none is held out.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 
 FOLDER = "checkpoint"
 TRACKER = "tracker.npz"
-STREAM = 1_000_000_000  # frames, a multiple of HELD_OUT_EVERY
+STREAM = 1_000_000_000  # frames: more than a stream has
 NOTHING_MAPPED = "nothing is mapped yet: move the camera sideways until keyframes are mapped, and ask again"
 
 

@@ -191,4 +191,4 @@ def _message_types(annotation: Any) -> Iterator[type]:
             yield from _message_types(part)
 
 
-__all__ = ["Node", "Stats", "free_inputs", "handlers", "is_source", "outputs"]
+__all__ = ["Advice", "Node", "free_inputs", "handlers", "is_source", "outputs"]

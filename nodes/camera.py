@@ -10,33 +10,33 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
 
 from msgs import Frame
-from mvsgs_core.datasets.calibration import lens_from_option
+from mvsgs_core.datasets.calibration import check_lens_option, lens_from_option
 from mvsgs_core.datasets.framing import Framing
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.export.source_camera import LENS, lens_values
 from mvsgs_core.passwords import without_passwords
-from nodes.live import LiveSource, camera_mask
-from nodes.stream_frames import StreamFrames
+from nodes.live import POLL, LiveSource, camera_mask
 from nodes.stream_presence import Presence, pauses
 
 ANSWER = 5.0  # s for a network camera to answer, before it is tried again
-POLL = 0.5  # s at most between two looks at whether the stream goes on
 DEVICES = "/dev/"
 MANY = 2**40  # frames: no file has as many; OpenCV counts them so, or below zero, where a stream has no end
 
 
 class CameraError(OSError):
-    """A camera that cannot be opened or gives no picture; the message says what to check."""
+    """A camera that cannot be opened; the message says what to check."""
 
 
 class Camera(LiveSource):
-    """A device or a URL. Raises CameraError if it cannot be opened or never gives a picture."""
+    """A device or a URL. Raises CameraError if it cannot be opened, TimeoutError if it never gives a picture."""
+
+    stamped: ClassVar[bool] = False
 
     @dataclass
     class Config(LiveSource.Config):
@@ -46,7 +46,6 @@ class Camera(LiveSource):
         intrinsics: list[float] | str = "auto"  # [fx, fy, cx, cy] in pixels of the camera's picture; auto: a guess
         distortion: list[float] = field(default_factory=list)  # [k1, k2, p1, p2] or with k3, as in OpenCV
         crop: int | None = None  # pixels cut off after undistortion; null: zoom to hide the empty border
-        timeout: float = 30.0  # s without a usable picture, while it is looked for, before the stream ends
 
     config: Config
 
@@ -54,13 +53,10 @@ class Camera(LiveSource):
         super().__init__(config)
         self._framing = Framing(self.config.size, self.config.crop)
         self._lens: Lens | None = None
-        self._called = _called(self.config)
-        self._frames = StreamFrames(self.stats, self._called, stamped=False)
-        self._presence = Presence(self.stats, self._called, self.config.timeout)
 
     @classmethod
     def check(cls, config: Config) -> None:
-        lens_from_option(config.intrinsics, config.distortion, (480, 640))
+        check_lens_option(config.intrinsics, config.distortion, config.resolution)
         camera_mask(config.mask)
         number = device_number(config.path)
         device = Path(f"/dev/video{number}" if config.path.isdecimal() else config.path)
@@ -77,27 +73,25 @@ class Camera(LiveSource):
     def _close(self) -> None:
         self._feed.close()
 
-    def _take(self, first: bool) -> Frame | None:
-        """The next usable picture. Raises CameraError where none ever comes."""
-        began = time.monotonic()
-        while (left := max(began, self._frames.heard) + self.config.timeout - time.monotonic()) > 0:
-            shot = self._feed.newest(min(POLL, left))
-            self.stats.counts["dropped"] = self._feed.dropped
-            if shot is None:
-                self._presence.wait(began)
-                continue
-            picture, timestamp, stamp = shot
-            lens = self._lens_of(picture)
-            frame = Frame(0, timestamp, picture, np.array(lens.intrinsics), lens.guessed, stamp=stamp)
-            usable = self._frames.accept(frame)
-            if usable is not None:
-                return usable
-        silence = f"gave no usable picture for {self.config.timeout:g} s"
-        if first:
-            said = f": {self.stats.warnings[-1]}" if self.stats.warnings else ""
-            raise CameraError(f"{self._called} {silence}{said}")
-        self.stats.warn(f"{self._called} {silence}: the stream ends here")
-        return None
+    @property
+    def _sender(self) -> str:
+        return _called(self.config)
+
+    @property
+    def _silence(self) -> str:
+        return f"{self._sender} gave no usable picture"
+
+    def _hint(self) -> str:
+        return "it was opened, but gives none"
+
+    def _next(self, seconds: float) -> Frame | None:
+        shot = self._feed.newest(seconds)
+        self.stats.counts["dropped"] = self._feed.dropped
+        if shot is None:
+            return None
+        picture, timestamp, stamp = shot
+        lens = self._lens_of(picture)
+        return Frame(0, timestamp, picture, np.array(lens.intrinsics), lens.guessed, stamp=stamp)
 
     def _lens_of(self, picture: np.ndarray) -> Lens:
         """Of the stream: its first picture's."""

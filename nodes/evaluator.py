@@ -161,8 +161,8 @@ class Evaluator(Node):
         self.report["protocol"] = (
             "Scored at native resolution; strict: nothing is fitted to a scored frame, exposure neither. "
             f"{_fitted(self.report)}"
-            f"Keyframes are training views; held-out: every {HELD_OUT_EVERY}th frame that is no keyframe. Covered: "
-            "pixels at which the render is more than half opaque. "
+            f"Keyframes are training views; held-out: every {HELD_OUT_EVERY}th frame after the first that is no "
+            "keyframe. Covered: pixels at which the render is more than half opaque. "
             f"LPIPS: {'v0.1, SqueezeNet trunk' if self._lpips else 'not computed'}. "
             f"{_shutter(self.evaluation.trajectory)}{_exposure(self.report['exposure'])}"
             f"{_masked(self.evaluation.masked)}{_aligned(self.report['trajectory'])}"

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from msgs import Frame, FusedKeyframe, Keyframe, Message, Poses, SplatMap, TrackedFrame, Trajectory
-from mvsgs_core import camera
+from mvsgs_core import camera, geometry
 from mvsgs_core.export import foxglove_messages as foxglove
 
 READ = (Frame, Keyframe, TrackedFrame, FusedKeyframe, Poses, Trajectory, SplatMap)  # what there is something to see of
@@ -112,8 +112,7 @@ class FoxgloveView:
         if placed is None or placed.segment is None:
             self._waiting.setdefault(between.keyframe, []).append(between)
             return
-        keyframe_from_cam = between.keyframe_from_cam.copy()
-        keyframe_from_cam[:3, 3] *= placed.scale / between.scale
+        keyframe_from_cam = geometry.scaled(between.keyframe_from_cam, placed.scale / between.scale)
         yield from _posed(between.ns, placed.segment, placed.world_from_cam @ keyframe_from_cam)
 
     def _correct(self, poses: Poses) -> None:

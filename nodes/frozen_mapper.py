@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,13 +13,13 @@ from msgs import Asked, CameraPose, Frame, Preview, Reply, Request, SplatMap
 from mvsgs_core.kept_map import check_kept_map
 from mvsgs_core.mapping.checkpoints.begun import begin_on
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
-from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, training_view
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mapping.preview import preview_arrays, seen
 from mvsgs_core.stats import Stats
 from nodes import Node
 from nodes.once import Once
+from nodes.previews import PreviewConfig, Previews
 from nodes.splat_map import splat_map
 
 NEWEST = 8  # frames that wait for their poses, to be shown
@@ -34,9 +33,7 @@ class FrozenMapper(Node):
     """
 
     @dataclass(frozen=True)
-    class Config(MapperConfig):
-        preview_period: float = 1.0  # seconds between previews; 0: none
-        preview_splats: int = 100000  # at most so many in a preview
+    class Config(PreviewConfig):
         map: str | None = None  # output of the run that kept the map
         keep_map: bool = False  # it is kept where it is
 
@@ -49,7 +46,7 @@ class FrozenMapper(Node):
         self._once = Once(self.stats)
         self._found: Counter[int] = Counter()  # frames in each part of the map
         self._frames: dict[int, Frame] = {}
-        self._last_preview = 0.0
+        self._previews = Previews(self, self.config)
 
     @classmethod
     def check(cls, config: Config) -> None:
@@ -60,7 +57,7 @@ class FrozenMapper(Node):
 
     def on_frame(self, frame: Frame) -> Iterator[Preview]:
         """For previews alone."""
-        if self._previewing:
+        if self._previews.wanted:
             self._frames[frame.index] = frame
             for index in sorted(self._frames)[:-NEWEST]:
                 del self._frames[index]
@@ -69,9 +66,9 @@ class FrozenMapper(Node):
     def on_camera_pose(self, pose: CameraPose) -> Iterator[Preview]:
         self._found[pose.segment] += 1
         self.stats.values |= {"splats": len(self._mapper.state), "confidence": round(pose.confidence, 3)}
-        now, frame = time.monotonic(), self._frames.get(pose.index)
-        if self._previewing and frame is not None and now - self._last_preview >= self.config.preview_period:
-            self._last_preview = now
+        frame = self._frames.get(pose.index)
+        if frame is not None and self._previews.due:
+            self._previews.begin()
             yield self._preview(pose, frame)
 
     def on_request(self, request: Request) -> Iterator[Reply]:
@@ -100,10 +97,6 @@ class FrozenMapper(Node):
             if segment in self.atlas.parts:
                 return self.atlas.parts[segment]
         return self.atlas.current
-
-    @property
-    def _previewing(self) -> bool:
-        return self.config.preview_period > 0 and Preview not in self.unread
 
     def _preview(self, pose: CameraPose, frame: Frame) -> Preview:
         mapper = self._mapper

@@ -9,11 +9,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-from msgs import Frame, GroundTruth
+from msgs import End, Frame, GroundTruth
 from mvsgs_core.datasets.masks import CameraMask
 from mvsgs_core.datasets.options import SizedSelection
 from nodes import Node
 from nodes.fixed_mask import FixedMask
+from nodes.stream_frames import StreamFrames
+from nodes.stream_presence import Presence
+
+POLL = 0.5  # s at most between two looks at whether the stream goes on
 
 
 def camera_mask(file: str | Path | None) -> CameraMask | None:
@@ -22,18 +26,22 @@ def camera_mask(file: str | Path | None) -> CameraMask | None:
 
 
 class LiveSource(Node, ABC):
-    """Frame, and GroundTruth with the same image to score renders against."""
+    """Frame, and GroundTruth with the same image to score renders against. A subclass says what comes."""
 
     live: ClassVar[bool] = True
+    stamped: ClassVar[bool] = True  # frames come with the time at which they were taken
 
     @dataclass
     class Config(SizedSelection):
         hide_fixed: bool = True  # mask what is fixed to the camera: a logo, a robot's arm; not beside `mask`
+        timeout: float = 30.0  # s without a usable frame, while it is waited for, before the stream ends
 
     config: Config
 
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
+        self._frames = StreamFrames(self.stats, self._sender, self.stamped)
+        self._presence = Presence(self.stats, self._sender, self.config.timeout)
         self._camera_mask = camera_mask(self.config.mask)
         for note in [] if self._camera_mask is None else self._camera_mask.notices:
             self.stats.warn(note)
@@ -50,7 +58,10 @@ class LiveSource(Node, ABC):
                     return
                 came = time.time()
                 if self.config.has(taken):
-                    shown = replace(fixed.masked(self._framed(frame)), index=index, captured=came)
+                    shown = replace(
+                        fixed.masked(self._framed(frame)), index=index, captured=came,
+                        original_intrinsics=frame.intrinsics,
+                    )  # fmt: skip
                     self.stats.count("frames")
                     yield shown
                     yield GroundTruth(
@@ -61,12 +72,43 @@ class LiveSource(Node, ABC):
         finally:
             self._close()
 
+    def _take(self, first: bool) -> Frame | None:
+        """The next usable frame, as it comes; None at the stream's end. Raises TimeoutError where none ever comes."""
+        began = time.monotonic()
+        while (left := max(began, self._frames.heard) + self.config.timeout - time.monotonic()) > 0:
+            came = self._next(min(POLL, left))
+            if isinstance(came, End):
+                return None
+            if came is None:
+                self._presence.wait(began)
+            elif (usable := self._frames.accept(came)) is not None:
+                return usable
+        silence = f"{self._silence} for {self.config.timeout:g} s"
+        if first:
+            raise TimeoutError(f"{silence}: {self.stats.warnings[-1] if self.stats.warnings else self._hint()}")
+        self.stats.warn(f"{silence}: the stream ends here")
+        return None
+
+    @property
+    def _sender(self) -> str:
+        """As warnings name it."""
+        return "the camera"
+
+    @property
+    @abstractmethod
+    def _silence(self) -> str:
+        """That nothing usable comes, as a user reads it."""
+
+    @abstractmethod
+    def _hint(self) -> str:
+        """What to look at where nothing came at all."""
+
     @abstractmethod
     def _open(self) -> None: ...
 
     @abstractmethod
-    def _take(self, first: bool) -> Frame | None:
-        """The next frame of the stream, as it comes; None at its end. Raises where none ever comes."""
+    def _next(self, seconds: float) -> Frame | End | None:
+        """What comes within that time, None where nothing does; `_presence` is told of it."""
 
     @abstractmethod
     def _framed(self, frame: Frame) -> Frame:

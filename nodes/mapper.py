@@ -8,8 +8,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from msgs import Asked, FusedKeyframe, Keyframe, Poses, Preview, Reply, Request, SplatMap, TrackedFrame
 from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.keyframe_images import write_image
@@ -23,27 +21,23 @@ from mvsgs_core.mapping.checkpoints.checkpointing import Checkpointing
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from mvsgs_core.mapping.checkpoints.replay import Replay
 from mvsgs_core.mapping.checkpoints.saved_map import SavedMap
-from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.losses import loss_function
 from mvsgs_core.mapping.mapper import OnlineMapper
-from mvsgs_core.mapping.preview import preview_arrays
-from mvsgs_core.mapping.provisional import Provisional
 from mvsgs_core.mapping.self_check import why_nothing
 from mvsgs_core.mapping.trainer import FINAL_RATE
+from mvsgs_core.mapping.warm_up import warm_up
 from mvsgs_core.pace import Effort, Pace
 from nodes import Node
 from nodes.last_seconds import LastSeconds
-from nodes.mapped_messages import coarse_keyframe, frame_between, rgbd_keyframe
+from nodes.mapped_messages import frame_between, rgbd_keyframe
 from nodes.once import Once
-from nodes.preview_delay import PreviewDelay
+from nodes.previews import GrowingPreviews, PreviewConfig
 from nodes.runtime.freed_memory import return_large_blocks
-from nodes.runtime.status import rss
 from nodes.saved_maps import ABORT, SavedMaps
 from nodes.splat_map import splat_map
 
 _SLICE = 0.05  # seconds of optimization in one on_idle
-PREVIEWS = 0.1  # of the time that previews may take in real time
 EFFORTS = (  # one by the number of halvings of the image
     Effort("full", 1.0),
     Effort("new splats as of half the image's size", 0.5),
@@ -65,9 +59,7 @@ class Mapper(Node):
     """
 
     @dataclass(frozen=True)
-    class Config(MapperConfig):
-        preview_period: float = 1.0  # seconds between previews; 0: none
-        preview_splats: int = 100000  # at most so many in a preview
+    class Config(PreviewConfig):
         output: str | None = None  # folder for map.ply and cameras.json; null: none is written
         checkpoint: float = 30.0  # seconds of the stream or the clock between checkpoints in the output; 0: none
         keep_map: bool = False  # the finished map's checkpoint stays, for another run to begin on
@@ -85,23 +77,21 @@ class Mapper(Node):
         self._once = Once(self.stats)
         self._last_captured = 0.0  # of the keyframes that came
         self._last_seconds = LastSeconds()
-        self._efforts = 0, 0  # that stereo and fusion made for the newest keyframe
-        self._unshown = False  # a map that was begun on and that no preview showed yet
-        self._preview_delay = PreviewDelay()
+        self._previews = GrowingPreviews(self, self.config)
         self.atlas, resumed = Atlas(OnlineMapper(self.config, self.stats)), None
         self._replay: Replay | None = None
         if self.config.resume is not None:
             self.atlas, resumed = checkpoint.load(Path(self.config.resume), self.config, self.stats)
             self._replay = Replay(self.atlas)
         elif self.config.map is not None:
-            self.atlas, self._unshown = begin_on(Path(self.config.map), self.config, self.stats), True
+            self.atlas = begin_on(Path(self.config.map), self.config, self.stats)
+            self._previews.unshown = True
         self._checkpoints: Checkpointing | None = None
         if self.config.output is not None:
             self._checkpoints = Checkpointing(Path(self.config.output), self.config.checkpoint, self.atlas, resumed)
         self._frozen = False  # frames are only found in the map
         self._saved = SavedMaps(self.stats)
-        self._last_preview = self._preview_seconds = 0.0
-        self._provisional = Provisional(self.config.preview_splats)
+        warm_up(self.config, self.atlas.current.state.device)
 
     @classmethod
     def check(cls, config: Config) -> None:
@@ -117,7 +107,7 @@ class Mapper(Node):
     def on_fused_keyframe(self, fused: FusedKeyframe) -> Iterator[Preview]:
         if not self._once.keyframe(fused):
             return
-        self._provisional.came(fused.index)
+        self._previews.came(fused)
         if self._replay and not self._replay.view(fused.index, fused.world_from_cam, fused.scale):
             self._pass_over(
                 "keyframes that do not fit" if self._replay.problem else "keyframes that the checkpoint has"
@@ -128,14 +118,14 @@ class Mapper(Node):
         with self._pace.spend() as effort:
             added = self._add(fused, effort)
         self.stats.arrived("keyframe to map", fused.captured)
-        self._efforts = fused.effort, fused.fusion_effort
+        self._previews.mapped(fused)
         self._came(fused)
         self._save_image(fused)
         if self._checkpoints is not None and added is not None:
             self._checkpoints.added(added)
         self._keep()
         self._report()
-        yield from self._preview()
+        yield from self._previews.of(self.atlas)
 
     def on_tracked_frame(self, frame: TrackedFrame) -> Iterator[Preview]:
         if is_held_out(frame.index):
@@ -145,16 +135,16 @@ class Mapper(Node):
         yield from ()
 
     def on_keyframe(self, keyframe: Keyframe) -> Iterator[Preview]:
-        if not self._previewing:
+        if not self._previews.wanted:
             return
         self._came(keyframe)
-        self._provisional.see(coarse_keyframe(keyframe))
-        yield from self._preview()
+        self._previews.see(keyframe)
+        yield from self._previews.of(self.atlas)
 
     def on_poses(self, poses: Poses) -> Iterator[Preview]:
         if not self._once.poses(poses):
             return
-        self._provisional.correct(poses.index, poses.world_from_cam, poses.scale, poses.segment)
+        self._previews.correct(poses)
         if self._replay and not self._replay.poses(poses.revision, poses.index, poses.world_from_cam, poses.scale):
             self._pass_over()
             return
@@ -183,12 +173,12 @@ class Mapper(Node):
         deadline = time.perf_counter() + _SLICE
         if self._frozen or not self._piece():
             self._keep()
-            return [*replies, *(self._preview(due=True) if self._unshown else ())] or None
+            return [*replies, *(self._previews.of(self.atlas, due=True) if self._previews.unshown else ())] or None
         while time.perf_counter() < deadline and self._piece():
             pass
         self._keep()
         self._report()
-        return [*replies, *self._preview()]
+        return [*replies, *self._previews.of(self.atlas)]
 
     def _piece(self) -> bool:
         """An iteration; of a live stream the first splats of a keyframe without any before it, and where none is
@@ -218,12 +208,12 @@ class Mapper(Node):
         while not self._frozen and (self._made_up() or self.atlas.refine()):
             self._keep()
             if self.config.realtime:
-                yield from self._preview()
+                yield from self._previews.of(self.atlas)
         self._report()
         self._check()
         if self._checkpoints is not None and len(self.atlas.current.state):
             self.stats.values["map_bytes"] = self._checkpoints.finish(self.atlas, source_camera(self.upstream))
-        yield from self._preview(due=True)  # who watches is left with the map as it is now
+        yield from self._previews.of(self.atlas, due=True)  # who watches is left with the map as it is now
         yield splat_map(self.atlas.current.snapshot(), refined=True)
         if self._checkpoints is not None:
             self._checkpoints.close(self.atlas, keep=self.config.keep_map)
@@ -274,7 +264,7 @@ class Mapper(Node):
         """Goes on in a map in which the tracker looks for the camera already."""
         try:
             self._go_on_with(begin_on(Path(folder), self.config, self.stats))
-            self._unshown = True
+            self._previews.unshown = True
         except ValueError as error:
             self._go_on_with(Atlas(OnlineMapper(self.config, self.stats)))
             what = f"the camera is looked for in {folder}, but its splats cannot be taken up ({error}); {before}"
@@ -284,7 +274,7 @@ class Mapper(Node):
     def _go_on_with(self, atlas: Atlas) -> None:
         """Another map; what is counted goes on."""
         self.atlas, self._replay = atlas, None
-        self._provisional, self._preview_delay = Provisional(self.config.preview_splats), PreviewDelay()
+        self._previews.begin_anew()
 
     def _pass_over(self, counted: str = "") -> None:
         """A message that is not taken in, as the checkpoint has it or the stream does not fit, which is said."""
@@ -318,8 +308,6 @@ class Mapper(Node):
         if keyframe.captured > 0.0:
             self._last_captured = max(self._last_captured, keyframe.captured)
             self._last_seconds.came(keyframe.captured)
-            if self._previewing:
-                self._preview_delay.came(keyframe)
 
     def _keep(self) -> None:
         """Between two iterations, where nothing is half changed."""
@@ -351,31 +339,3 @@ class Mapper(Node):
         self.stats.values |= {"keyframe_psnr": found.psnr, "image_noise": found.noise}
         if found.warning:
             self.stats.warn(found.warning)
-
-    @property
-    def _previewing(self) -> bool:
-        return self.config.preview_period > 0 and Preview not in self.unread
-
-    def _preview(self, due: bool = False) -> Iterator[Preview]:
-        now, mapper = time.monotonic(), self.atlas.current
-        period = max(self.config.preview_period, self._preview_seconds / PREVIEWS if self.config.realtime else 0.0)
-        due |= now - self._last_preview >= period
-        if not self._previewing or not due or not mapper.views or not len(mapper.state):
-            return
-        self._last_preview, self._unshown = now, False
-        with self.stats.time("provisional"):
-            provisional = self._provisional.splats(mapper, self.atlas.segments)
-        live = self.stats.latency("keyframe to map", "keyframe to preview") if self._last_captured else None
-        arrays = preview_arrays(mapper, self.config.preview_splats, provisional)
-        self._preview_seconds = time.monotonic() - now
-        yield Preview(
-            **arrays,
-            latency=None if live is None else np.array(live),
-            effort=self._efforts[0],
-            fusion_effort=self._efforts[1],
-            memory=rss(),
-            coarse=len(mapper.coarse),
-        )
-        shown = {view.index for view in mapper.views} | self._provisional.shown
-        for captured in self._preview_delay.shown(shown):
-            self.stats.arrived("keyframe to preview", captured)

@@ -9,6 +9,7 @@ import numpy as np
 
 from msgs import Frame, Keyframe
 from mvsgs_core.datasets.lens import Lens, Undistortion
+from mvsgs_core.export.source_camera import PHOTOGRAPHS
 from mvsgs_core.photographs.config import PhotographsConfig
 from mvsgs_core.photographs.tracker import PhotographTracker
 from mvsgs_core.tracking.publish import Update
@@ -16,6 +17,7 @@ from nodes.tracking import TrackerNode
 
 KEPT = 4  # lenses whose maps are kept: each photograph may have another, and a map takes as much as its image
 VISIBLE = 1.0  # pixels by which a distortion must bend the corner of an image to be taken out of it
+AS_IT_CAME = (1.0, 0.0, 0.0)  # a lens: factor on its focal lengths, k1 and k2
 
 
 class PhotographsTracker(TrackerNode):
@@ -72,6 +74,12 @@ class PhotographsTracker(TrackerNode):
             mask=None if frame.mask is None else lens.mask(frame.mask),
         )
 
+    def _report(self) -> None:
+        super()._report()
+        factor, k1, k2 = self.core.lens
+        if (factor, k1, k2) != AS_IT_CAME:
+            self.stats.values[PHOTOGRAPHS] = [factor, k1, k2] if self._bent else [factor, 0.0, 0.0]
+
     def _undistortion(self, frame: Frame) -> Undistortion:
         """Of the lens that was estimated in its part, for images such as this; none where nobody would see it."""
         factor, k1, k2 = self.core.keyframe_lens(frame.index)
@@ -87,9 +95,10 @@ class PhotographsTracker(TrackerNode):
             if bent > VISIBLE and (factor, k1, k2) not in self._said:
                 self._said.add((factor, k1, k2))
                 self._bent |= (factor, k1, k2) == self.core.lens
+                came = frame.intrinsics if frame.original_intrinsics is None else frame.original_intrinsics
+                camera = ",".join(f"{v:.2f}" for v in came * [factor, factor, 1.0, 1.0])
                 self.stats.warn(
                     f"the photographs are distorted, by up to {bent:.0f} pixels, which is taken out: "
-                    f"dataset.intrinsics=[{fx:.2f},{fy:.2f},{cx:.2f},{cy:.2f}] "
-                    f"dataset.distortion=[{k1:.5f},{k2:.5f},0,0] does it before"
+                    f"dataset.intrinsics=[{camera}] dataset.distortion=[{k1:.5f},{k2:.5f},0,0] does it before"
                 )
         return self._lenses[key]

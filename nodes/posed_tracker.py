@@ -16,7 +16,7 @@ from mvsgs_core.tracking.posed import PosedTracker as CoreTracker
 from mvsgs_core.tracking.publish import affine_of, changed_vignetting, differ
 from mvsgs_core.trajectory import velocities
 from nodes import Node
-from nodes.tracking import keep_place, places_of, refused, warn_of_guessed_focal
+from nodes.tracking import keep_place, places_of, refused, tracked_frame, warn_of_guessed_focal
 
 
 class PosedTracker(Node):
@@ -119,21 +119,9 @@ class PosedTracker(Node):
 
     def _between(self, found: Between) -> TrackedFrame:
         frame = self._frames[found.index]
-        velocity = self._velocity(frame.index) if self.config.readout_time else None
-        return TrackedFrame(
-            index=frame.index,
-            timestamp=frame.timestamp,
-            image=frame.image,
-            intrinsics=frame.intrinsics,
-            keyframe=found.keyframe,
-            keyframe_from_cam=found.keyframe_from_cam,
-            scale=1.0,
-            exposure=found.exposure,
-            velocity=velocity,
-            readout_time=0.0 if velocity is None else self.config.readout_time,
-            reads_columns=self.config.reads_columns,
-            mask=frame.mask,
-        )
+        readout_time, reads_columns = self.config.readout_time, self.config.reads_columns
+        velocity = self._velocity(frame.index) if readout_time else None
+        return tracked_frame(frame, found, frame.intrinsics, 1.0, velocity, readout_time, reads_columns)
 
     def _velocity(self, index: int) -> np.ndarray | None:
         """(6,) between the poses before and after a frame; None where no neighbor tells it."""

@@ -79,7 +79,7 @@ class Reader(Node):
                 guessed, exposure = item.intrinsics_guessed, item.exposure
                 yield Frame(
                     item.index, item.timestamp, item.image, item.intrinsics, guessed, exposure, captured=captured,
-                    place=item.place, mask=item.mask,
+                    place=item.place, mask=item.mask, original_intrinsics=item.original,
                 )  # fmt: skip
                 yield _ground_truth(item)
         finally:  # also when the run is interrupted

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,10 +17,6 @@ from mvsgs_core.export.source_camera import LENS, lens_values
 from nodes.live import LiveSource, camera_mask
 from nodes.runtime.addresses import TransportError, check_address, load_keys, unknown_host
 from nodes.runtime.transport import LiveReader
-from nodes.stream_frames import StreamFrames
-from nodes.stream_presence import Presence
-
-POLL = 0.5  # s at most between two looks at the clock
 
 
 class Robot(LiveSource):
@@ -34,15 +29,12 @@ class Robot(LiveSource):
     @dataclass
     class Config(LiveSource.Config):
         path: str = "tcp://127.0.0.1:5555"  # address at which the other program publishes Frame messages
-        timeout: float = 30.0  # s without a usable frame before the robot counts as gone
         keys: str | None = None  # folder with the CURVE keys that the publisher has too; null: none
 
     config: Config
 
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
-        self._frames = StreamFrames(self.stats, "the robot")
-        self._presence = Presence(self.stats, "the robot", self.config.timeout)
         self._breaks = 0  # of the connection, that were said
 
     @classmethod
@@ -65,31 +57,28 @@ class Robot(LiveSource):
     def _close(self) -> None:
         self._reader.close()
 
-    def _take(self, first: bool) -> Frame | None:
-        """The next usable frame. Raises TimeoutError where none ever comes."""
-        began = time.monotonic()
-        while (left := max(began, self._frames.heard) + self.config.timeout - time.monotonic()) > 0:
-            try:
-                message = self._reader.receive(min(POLL, left))
-            except CodecError as error:
-                self.stats.warn(f"the robot sent what is no Frame, it was left out: {error}")
-                continue
-            finally:
-                self._watch(self._reader)
-            if isinstance(message, End):
-                return None
-            if isinstance(message, Frame):
-                self._presence.came()
-                if (usable := self._frames.accept(message)) is not None:
-                    return usable
-            else:
-                self._presence.wait(began)
-        silence = f"no usable frame from {self.config.path} for {self.config.timeout:g} s"
-        if first:
-            hint = "is the program that publishes there running (see examples/robot.py)?"
-            raise TimeoutError(f"{silence}: {self.stats.warnings[0] if self.stats.warnings else hint}")
-        self.stats.warn(f"{silence}: the stream ends here")
-        return None
+    @property
+    def _sender(self) -> str:
+        return "the robot"
+
+    @property
+    def _silence(self) -> str:
+        return f"no usable frame from {self.config.path}"
+
+    def _hint(self) -> str:
+        return "is the program that publishes there running (see examples/robot.py)?"
+
+    def _next(self, seconds: float) -> Frame | End | None:
+        try:
+            message = self._reader.receive(seconds)
+        except CodecError as error:
+            self.stats.warn(f"the robot sent what is no Frame, it was left out: {error}")
+            return None
+        finally:
+            self._watch(self._reader)
+        if isinstance(message, Frame):
+            self._presence.came()
+        return message if isinstance(message, Frame | End) else None
 
     def _watch(self, reader: LiveReader) -> None:
         self.stats.counts["dropped"] = reader.skipped

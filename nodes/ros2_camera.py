@@ -11,7 +11,7 @@ import numpy as np
 
 from msgs import Frame
 from mvsgs_core.bad_file import BadFileError
-from mvsgs_core.datasets.calibration import lens_from_option
+from mvsgs_core.datasets.calibration import check_lens_option, lens_from_option
 from mvsgs_core.datasets.framing import Framing, same_shape
 from mvsgs_core.datasets.lens import Lens, Undistortion
 from mvsgs_core.datasets.ros import COMPRESSED, calibrated, camera_info_topic, lens_of, rectified, rgb_of
@@ -20,8 +20,6 @@ from nodes.live import LiveSource, camera_mask
 from nodes.ros2.cdr import CdrError
 from nodes.ros2.connection import LOOPBACK, SENSOR_DATA, Connection, check_installed
 from nodes.ros2.messages import CameraInfo, CompressedImage, Image
-from nodes.stream_frames import StreamFrames
-from nodes.stream_presence import Presence
 
 if TYPE_CHECKING:
     from nodes.ros2.dds import Reader
@@ -47,7 +45,6 @@ class Ros2Camera(LiveSource):
         distortion: list[float] = field(default_factory=list)  # with intrinsics: [k1, k2, p1, p2(, k3)] as in OpenCV
         crop: int | None = None  # pixels cut off after undistortion; null: zoom to hide the empty border
         info_timeout: float = 5.0  # s from the first image without a CameraInfo before the focal length is guessed
-        timeout: float = 30.0  # s without a usable image before the camera counts as gone
         # lost images are sent again, for which the sender must be reliable too; null: once some were lost, if it is
         reliable: bool | None = None
         queue: int = SENSOR_DATA.depth  # images that may wait; of these the newest is taken
@@ -67,8 +64,6 @@ class Ros2Camera(LiveSource):
         super().__init__(config)
         c = self.config
         self._framing = Framing(c.size, c.crop)
-        self._frames = StreamFrames(self.stats, "the camera")
-        self._presence = Presence(self.stats, "the camera", c.timeout)
         self._topic = c.topic(c.path)
         self._info_topic = c.topic(c.info_topic) if c.info_topic else camera_info_topic(self._topic)
         self._lens: Lens | None = None
@@ -82,7 +77,7 @@ class Ros2Camera(LiveSource):
         check_installed()
         camera_mask(config.mask)
         if config.intrinsics is not None:
-            lens_from_option(config.intrinsics, config.distortion, (480, 640))
+            check_lens_option(config.intrinsics, config.distortion)
 
     def _open(self) -> None:
         """Raises DdsError."""
@@ -105,30 +100,23 @@ class Ros2Camera(LiveSource):
     def _close(self) -> None:
         del self._images, self._infos, self._participant
 
-    def _take(self, first: bool) -> Frame | None:
-        """The next usable image. Raises TimeoutError where none ever comes."""
-        began = time.monotonic()
-        while (left := max(began, self._frames.heard) + self.config.timeout - time.monotonic()) > 0:
-            self._images.wait(min(POLL, left))
-            waiting = self._images.take()
-            self._met = self._met or self._images.writers > 0
-            self._note_losses()
-            if not waiting:
-                if not first and not self._images.writers:
-                    self._presence.lost("nobody publishes its images any more")
-                self._presence.wait(began)
-                continue
-            self._presence.came()
-            self.stats.count("dropped", len(waiting) - 1)
-            with self.stats.time("image"):
-                frame = self._frame(waiting[-1])
-            if frame is not None and (usable := self._frames.accept(frame)) is not None:
-                return usable
-        silence = f"no usable image at {self._topic} for {self.config.timeout:g} s"
-        if first:
-            raise TimeoutError(f"{silence}: {self.stats.warnings[0] if self.stats.warnings else self._why_nothing()}")
-        self.stats.warn(f"{silence}: the stream ends here")
-        return None
+    @property
+    def _silence(self) -> str:
+        return f"no usable image at {self._topic}"
+
+    def _next(self, seconds: float) -> Frame | None:
+        self._images.wait(min(POLL, seconds))
+        waiting = self._images.take()
+        self._met = self._met or self._images.writers > 0
+        self._note_losses()
+        if not waiting:
+            if self._frames.native is not None and not self._images.writers:
+                self._presence.lost("nobody publishes its images any more")
+            return None
+        self._presence.came()
+        self.stats.count("dropped", len(waiting) - 1)
+        with self.stats.time("image"):
+            return self._frame(waiting[-1])
 
     def _note_losses(self) -> None:
         """Of datagrams: a best-effort image of which one is lost never comes, and nothing else tells of it."""
@@ -153,7 +141,7 @@ class Ros2Camera(LiveSource):
             "More room: sudo sysctl net.core.rmem_max=16777216"
         )
 
-    def _why_nothing(self) -> str:
+    def _hint(self) -> str:
         c = self.config
         if self._met:
             return "somebody publishes there, but sends nothing"

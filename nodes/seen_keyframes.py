@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import torch
 
 from msgs import SplatMap
 from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.export.cameras import Cameras
 from mvsgs_core.export.keyframe_render import rendered_keyframe
 from mvsgs_core.export.snapshot import Snapshot
-from mvsgs_core.mapping.preview import as_bytes
+from mvsgs_core.mapping.preview import known_depth
+from mvsgs_core.rasterizer.interface import as_bytes
 from nodes.keyframe_pictures import difference, thumbnail
 from nodes.splat_map import snapshot_of
 
@@ -103,8 +103,7 @@ class SeenKeyframes:
             exposures=self.final.exposures[k : k + 1], vignetting=self.final.vignetting,
         )  # fmt: skip
         color, render = rendered_keyframe(self.final, camera, 0)
-        depth = torch.where(render.opacity > 0.5, render.depth, 0.0).numpy()
-        return photograph, as_bytes(color), depth
+        return photograph, as_bytes(color), known_depth(render).numpy()
 
     def caption(
         self, keyframe: SeenKeyframe, photograph: np.ndarray, render: np.ndarray, depth: np.ndarray | None

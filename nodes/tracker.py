@@ -21,7 +21,7 @@ from mvsgs_core.tracking.publish import Correction, Update
 from mvsgs_core.tracking.tracker import Tracker as CoreTracker
 from nodes.localization_file import LocalizationFile
 from nodes.returning import Returning
-from nodes.tracking import TrackerNode
+from nodes.tracking import TrackerNode, tracked_frame
 
 ONLY_LOCALIZES = "this run only localizes: begin one with map=DIR and without mapper=frozen, and switch by localize"
 
@@ -158,7 +158,8 @@ class Tracker(TrackerNode):
             raise ValueError("no frame has come yet: ask again when one has, or begin the run with map=DIR")
         core = CoreTracker(self.config, known=_known(folder), frozen=self.core.frozen, stats=self.core.stats)
         frame = self._newest
-        core.begin((frame.image.shape[0], frame.image.shape[1]), frame.intrinsics, frame.intrinsics_guessed)
+        size, guessed = (frame.image.shape[0], frame.image.shape[1]), frame.intrinsics_guessed
+        core.begin(size, frame.intrinsics, guessed, frame.original_intrinsics)
         return core
 
     def _save(self, folder: str) -> None:
@@ -181,8 +182,10 @@ class Tracker(TrackerNode):
         self._without_shutter.clear()
 
     def _add(self, frame: Frame) -> Update:
-        guessed, exposure, mask = frame.intrinsics_guessed, frame.exposure, frame.mask
-        return self.core.follow(frame.index, frame.timestamp, frame.image, frame.intrinsics, guessed, exposure, mask)
+        return self.core.follow(
+            frame.index, frame.timestamp, frame.image, frame.intrinsics, frame.intrinsics_guessed, frame.exposure,
+            frame.mask, frame.original_intrinsics,
+        )  # fmt: skip
 
     @property
     def _live(self) -> bool:
@@ -271,20 +274,8 @@ class Tracker(TrackerNode):
 
     def _between(self, found: Between) -> TrackedFrame:
         frame, velocity = self._frames[found.index], found.velocity if self.config.rectify_rolling_shutter else None
-        return TrackedFrame(
-            index=frame.index,
-            timestamp=frame.timestamp,
-            image=frame.image,
-            intrinsics=self._intrinsics(frame),
-            keyframe=found.keyframe,
-            keyframe_from_cam=found.keyframe_from_cam,
-            scale=self.core.scale(found.keyframe),
-            exposure=found.exposure,
-            velocity=velocity,
-            readout_time=0.0 if velocity is None else self._readout_time,
-            reads_columns=self._reads_columns,
-            mask=frame.mask,
-        )
+        intrinsics, scale = self._intrinsics(frame), self.core.scale(found.keyframe)
+        return tracked_frame(frame, found, intrinsics, scale, velocity, self._readout_time, self._reads_columns)
 
     def _intrinsics(self, frame: Frame) -> np.ndarray:
         return frame.intrinsics * [self.core.focal_factor, self.core.focal_factor, 1.0, 1.0]

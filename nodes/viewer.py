@@ -9,13 +9,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import torch
 import viser
 
 from msgs import Preview, SplatMap, TrackerPhase
 from mvsgs_core.export.ply import folded
-from mvsgs_core.mapping.preview import as_bytes, covariances, thinned
-from mvsgs_core.rasterizer.spherical_harmonics import C0
+from mvsgs_core.mapping.preview import gaussian_arrays, thinned
 from nodes import Node
 from nodes.keyframe_pictures import KeyframePictures, depth_points, pictures
 from nodes.map_page import MapPage, check_address, escaped
@@ -135,10 +133,7 @@ class Viewer(Node):
                     self.page.begin(final.relative_pose(message.world_from_cam[-1]), message.means)
                 shown = thinned(folded(final.splats, final.kernel), self.config.max_splats)
                 self._move(dict(zip(final.keyframes.tolist(), map(final.relative_pose, final.world_from_cam))))
-                self._show_splats(
-                    shown.means.numpy(), covariances(shown.quaternions, shown.log_scales, 1.0).numpy(),
-                    as_bytes(0.5 + C0 * shown.sh[:, 0]), torch.sigmoid(shown.opacity_logits).numpy(),
-                )  # fmt: skip
+                self._show_splats(**gaussian_arrays(shown))
                 self._iterations = message.iterations
                 self._shown = f"the **refined** map, {len(shown)} splats, {message.iterations} iterations"
                 self._show_chosen()

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 import numpy as np
 
 from msgs import Asked, Depth, FusedKeyframe, Keyframe, Poses, Request, TrackedFrame
+from mvsgs_core import geometry
 from mvsgs_core.keyframe_window import Correction, WindowedKeyframe
 from mvsgs_core.pace import Pace
 from nodes import Node
@@ -41,7 +42,6 @@ Core = TypeVar("Core", bound=WindowedCore)
 Found = TypeVar("Found")  # what the core finds of a keyframe
 Sent = TypeVar("Sent", Depth, FusedKeyframe)  # the message of it
 K = TypeVar("K", bound=WindowedKeyframe)
-Lit = TypeVar("Lit", Depth, FusedKeyframe)
 
 
 class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
@@ -122,7 +122,7 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
             self._vignetting = None
         yield request
 
-    def _exposed(self, message: Lit) -> Lit:
+    def _exposed(self, message: Sent) -> Sent:
         """With exposure and vignetting as they are now: corrections may have overtaken the keyframe."""
         exposure = self._exposures.get(message.index, message.exposure)
         vignetting = message.vignetting if self._vignetting is None else self._vignetting
@@ -137,7 +137,7 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
         velocity, scale, readout_time, reads_columns = self._velocities.get(message.index, as_sent)
         photograph = message.photograph
         if velocity is not None:
-            velocity = velocity * np.repeat([now.scale / scale, 1.0], 3)
+            velocity = geometry.twist_scaled(velocity, now.scale / scale)
             photograph = message.image if photograph is None else photograph
         return {
             "world_from_cam": now.world_from_cam, "scale": now.scale, "segment": now.segment,

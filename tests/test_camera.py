@@ -21,6 +21,7 @@ import pytest
 import nodes.camera
 import nodes.stream_presence
 from msgs import Frame, GroundTruth
+from mvsgs_core.datasets.lens import guess_lens
 from mvsgs_core.stats import Stats
 from nodes.camera import Camera, CameraError
 from nodes.stream_presence import Presence, pauses
@@ -42,6 +43,7 @@ def test_camera_delivers_frames_with_guessed_intrinsics(capture: type[FakeCaptur
     assert messages[0].image[0, 0, 0] > 0
     assert messages[0].intrinsics[2] == 15.5
     assert messages[0].intrinsics_guessed
+    assert messages[0].original_intrinsics == pytest.approx(guess_lens((48, 64)).intrinsics)
     assert messages[1].world_from_cam is None
     assert any("guess" in w for w in camera.stats.warnings)
 
@@ -255,11 +257,17 @@ def test_a_camera_that_is_not_there(capture: type[FakeCapture], tmp_path: Path) 
     with pytest.raises(CameraError, match="rtsp://nowhere/x cannot be opened: is the address right"):
         list(Camera(Camera.Config(path="rtsp://nowhere/x")).run())
     capture.dead_after, capture.lost_after = None, 0
-    with pytest.raises(CameraError, match=r"gave no usable picture for 0\.2 s: camera 0 was lost"):
+    with pytest.raises(TimeoutError, match=r"gave no usable picture for 0\.2 s: camera 0 was lost"):
         list(Camera(Camera.Config(timeout=0.2)).run())
     (tmp_path / "walk.mp4").touch()
     with pytest.raises(CameraError, match="dataset=video"):
         list(Camera(Camera.Config(path=str(tmp_path / "walk.mp4"))).run())
+
+
+def test_a_camera_that_opens_and_never_answers(capture: type[FakeCapture]) -> None:
+    capture.gate.acquire()
+    with pytest.raises(TimeoutError, match=r"no usable picture for 0\.2 s: it was opened, but gives none"):
+        list(Camera(Camera.Config(timeout=0.2)).run())
 
 
 class Stream(http.server.BaseHTTPRequestHandler):
@@ -362,3 +370,20 @@ def test_a_stream_whose_frames_nobody_can_count_is_a_camera(capture: type[FakeCa
 def test_the_address_of_a_file_is_refused_before_anything_starts(scheme: str) -> None:
     with pytest.raises(CameraError, match=r"is a file and no camera: use dataset=video dataset.path=/data/walk\.mp4"):
         Camera.check(Camera.Config(path=f"{scheme}/data/walk.mp4"))
+
+
+LARGE = [2800.0, 2800.0, 1919.5, 1079.5]  # of 3840x2160
+
+
+def test_intrinsics_of_a_camera_of_any_size_are_taken(capture: type[FakeCapture]) -> None:
+    address = "rtsp://host/stream"
+    Camera.check(Camera.Config(path=address, intrinsics=LARGE))
+    Camera.check(Camera.Config(path=address, intrinsics=LARGE, resolution=[2160, 3840]))
+    for wrong in ([2800.0, 2800.0, float("nan"), 1079.5], [-1.0, 2800.0, 1919.5, 1079.5], [2800.0, 2800.0, 1919.5]):
+        with pytest.raises(ValueError, match=r"intrinsics|focal"):
+            Camera.check(Camera.Config(path=address, intrinsics=wrong))
+    with pytest.raises(ValueError, match="far outside of 640x480"):
+        Camera.check(Camera.Config(path=address, intrinsics=LARGE, resolution=[480, 640]))
+    camera = Camera(Camera.Config(stop=1, intrinsics=[100, 100, 63.5, 47.5]))  # its pictures are of 64x48
+    list(camera.run())
+    assert any("of another size (about 128x96)" in w for w in camera.stats.warnings)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import tomllib
 from importlib.metadata import PackageNotFoundError
 
 import pytest
@@ -19,6 +20,17 @@ def pinned(name: str) -> str:
     requirements = [Requirement(line) for line in lines if not line.startswith("#")]
     (found,) = [requirement for requirement in requirements if requirement.name == name]
     return str(found.specifier).removeprefix("==")
+
+
+def test_all_that_is_asked_for_is_pinned_but_what_the_header_names() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    header = (ROOT / "constraints.txt").read_text().partition("annotated-types")[0]
+    extras = project["optional-dependencies"]
+    unpinned = {extra for extra in extras if f"`{extra}`" in header}
+    assert unpinned == {"docs", "ray"}
+    asked = [*project["dependencies"], *(line for extra in extras.keys() - unpinned for line in extras[extra])]
+    for requirement in map(Requirement, asked):
+        assert requirement.specifier.contains(pinned(requirement.name)), requirement
 
 
 def test_triton_is_the_one_that_torch_asks_for() -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shlex
+import signal
+import tomllib
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.util import find_spec
@@ -11,8 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from packaging.requirements import Requirement
 
 from bench import figures, plots, record
+from launch import outcome
 from launch.compose import choices_of, compose
 from launch.refusal import GraphError
 from mvsgs.command import COMMANDS
@@ -116,6 +120,32 @@ def test_commands_and_their_options_exist(document: Path) -> None:
         source = source_of(words)
         for option in [word.partition("=")[0] for word in words if word.startswith("--")]:
             assert source is not None and f'"{option}"' in source, f"{document.name}: {line}: {option}"  # noqa: PT018
+
+
+def test_the_exit_codes_of_the_guide_are_those_of_a_run() -> None:
+    text = (ROOT / "docs" / "guides" / "own_video.md").read_text()
+    said = re.findall(r"^\| ([\d, ]+) \|", text.partition("| exit code |")[2], re.MULTILINE)
+    signals = {outcome.BY_SIGNAL + number for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)}
+    codes = {outcome.DONE, outcome.FAILED, outcome.REFUSED, outcome.NOTHING, outcome.OBSERVER_FAILED} | signals
+    assert [int(code) for row in said for code in row.split(", ")] == sorted(codes)
+
+
+def installed_by_name(text: str) -> Iterator[Requirement]:
+    """What it says to install from an index."""
+    for quoted, plain in re.findall(r"""pip install (?:["']([^"']+)["']|([A-Za-z][\w-]*\b(?![/*.])))""", text):
+        yield Requirement(quoted or plain)
+
+
+def test_what_is_installed_by_name_is_what_the_extras_ask_for() -> None:
+    """And never this by its own name: until it is released, that may be anybody's."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    asked = [Requirement(line) for lines in extras.values() for line in lines]
+    sources = [file for folder in FOLDERS if folder != "tests" for file in sorted((ROOT / folder).rglob("*.py"))]
+    found = [(file, name) for file in (*DOCUMENTS, *sources) for name in installed_by_name(file.read_text())]
+    assert {"ray", "hydra-submitit-launcher", "rosbags"} <= {requirement.name for _, requirement in found}
+    for file, requirement in found:
+        assert requirement.name != "mvsgs", file.name
+        assert not requirement.specifier or requirement in asked, f"{file.name}: {requirement}"
 
 
 def flat(config: Mapping[str, Any], prefix: str) -> Iterator[str]:

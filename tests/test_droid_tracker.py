@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from msgs import (
 )
 from nodes import handlers, outputs
 from nodes.droid_tracker import DroidTracker
+from tests.support.gpu import GPU
 from tests.support.sequences import synthetic
 
 COUNT = 9
@@ -44,8 +46,9 @@ def test_contract() -> None:
 
 
 @pytest.mark.slow
-def test_noise_gives_honest_finite_messages() -> None:
-    node, sent, frames = run(TRIAL)
+@pytest.mark.parametrize("device", ["cpu", GPU])
+def test_noise_gives_honest_finite_messages(device: str) -> None:
+    node, sent, frames = run(replace(TRIAL, device=device))
     assert any("noise" in warning for warning in node.stats.warnings)
     keyframes = [m for m in sent if isinstance(m, Keyframe)]
     poses = [m for m in sent if isinstance(m, Poses)]

@@ -10,7 +10,8 @@ import pytest
 
 from msgs import End
 from msgs.codec import decode, encode
-from nodes import Node, Stats
+from mvsgs_core.stats import Stats
+from nodes import Node
 from nodes.runtime.plain import SHORTENED
 from nodes.runtime.process import _say_cut_off
 from nodes.runtime.runner import STATS_KEYS, end_of

@@ -39,7 +39,7 @@ def test_report(evaluator: Evaluator) -> None:
     report = feed(evaluator)
     after, before = report["rendering"], report["rendering_before_refinement"]
     assert after["keyframes"]["count"] == 4
-    assert after["held_out"]["count"] == 2  # frames 5 and 10; 0 is a keyframe
+    assert after["held_out"]["count"] == 2  # frames 5 and 10
     assert after["all"]["count"] == N
     assert after["keyframes"]["psnr"] > 35 > 15 > before["keyframes"]["psnr"]  # the far origin costs no precision
     assert after["all"]["lpips"] is None
@@ -202,10 +202,6 @@ def test_no_picture_is_shown_twice_where_few_frames_are_held_out(evaluator: Eval
     html = (evaluator.folder / "report.html").read_text()
     assert html.count("held-out frame: 10 (held out)") == 1
     assert "only held-out frame: 10" in html
-
-
-def test_held_out_frames_that_became_keyframes_are_named(evaluator: Evaluator) -> None:
-    assert feed(evaluator)["trajectory"]["held_out_keyframes"] == [0]
 
 
 def test_frames_without_a_pose_are_counted_by_state(evaluator: Evaluator) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from msgs import Frame, GroundTruth
+from msgs import End, Frame, GroundTruth
 from mvsgs_core.datasets import Item
 from mvsgs_core.datasets.fixed_parts import DOUBT, EVERY, WINDOW
 from mvsgs_core.stats import Stats
@@ -132,15 +131,20 @@ def test_at_the_recorded_rate_no_frame_waits_for_it(tmp_path: Path) -> None:
 class Shown(LiveSource):
     """A camera that shows a moving scene with a logo."""
 
-    def _open(self) -> None:
-        self._left: Iterator[np.ndarray] = frames(EVERY + 3)
+    _silence = "nothing is shown"
 
-    def _take(self, first: bool) -> Frame | None:
-        image = next(self._left, None)
+    def _hint(self) -> str:
+        return "look at it"
+
+    def _open(self) -> None:
+        self._left = enumerate(frames(EVERY + 3))
+
+    def _next(self, seconds: float) -> Frame | End:
+        number, image = next(self._left, (0, None))
         if image is None:
-            return None
+            return End()
         logo(image, 0)
-        return Frame(0, 0.0, image, np.array([100.0, 100.0, 80.0, 60.0]), False)
+        return Frame(0, number / 30, image, np.array([100.0, 100.0, 80.0, 60.0]), False)
 
     def _framed(self, frame: Frame) -> Frame:
         return frame

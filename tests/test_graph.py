@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from launch.compose import CONF, compose, slots_of
+from launch.compose import CONF, compose, defaults_of
 from launch.graph import Edge, Graph
 from launch.inline import run_inline
 from launch.placement import niceness, own_threads, thread_plan
@@ -252,6 +252,17 @@ def test_threads_fit_the_cores(cores: int) -> None:
     assert 1 <= plan["source"] <= cores
 
 
+def test_a_stage_on_a_gpu_leaves_the_cores_to_the_others() -> None:
+    def plan(*overrides: str) -> dict[str, int]:
+        return thread_plan(compose(["dataset=synthetic", "device=cpu", *overrides]), 16)
+
+    without, beside = plan(), plan("mapper.device=cuda:1")
+    assert (without["mapper"], beside["mapper"]) == (12, 1)
+    assert (beside["mvs"], beside["evaluator"]) == (12, 16)
+    assert beside["tracker"] > without["tracker"]
+    assert plan("mapper.device=cuda", "mvs.device=cuda")["tracker"] == 12
+
+
 @given(st.one_of(st.integers(-(2**53), 2**53), st.floats(allow_nan=False), st.text(), st.booleans(), st.none()))
 def test_a_value_is_converted_to_its_type_or_refused(value: object) -> None:
     for annotation in (int, float, bool, int | None, float | str):
@@ -273,7 +284,7 @@ def test_every_choice_file_of_the_project_composes() -> None:
         "mapper.reads={FusedKeyframe: dataset, TrackedFrame: dataset, Poses: dataset}",
         "evaluator.reads={GroundTruth: dataset, Trajectory: dataset, FusedKeyframe: dataset, SplatMap: mapper}",
     ]
-    for slot in slots_of(CONF):
+    for slot in defaults_of(CONF):
         for path in sorted((CONF / slot).glob("*.yaml")):
             others = stands_for_the_stages if (slot, path.stem) == ("dataset", "resumed") else []
             compose([f"{slot}={path.stem}", "device=cpu", *others])

@@ -1,10 +1,10 @@
-"""What the launcher prints of a command line without running it, and what it says of names that are gone."""
+"""What the launcher prints of a command line without running it."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_origin
@@ -16,10 +16,6 @@ from launch.field_comments import field_comments
 from launch.graph import load_node
 from launch.graph_text import graph_text
 from launch.help_text import MAX_WIDTH
-from launch.refusal import GraphError
-from launch.renamed_parameters import GONE, RENAMED
-from msgs import FusedKeyframe, Preview
-from nodes import Node
 from nodes.parameters import parameters
 from tests.support.shared_data import ROOT
 
@@ -29,17 +25,6 @@ def run_all(*words: str) -> str:
     shown = subprocess.run(command, capture_output=True, text=True, check=False)
     assert shown.returncode == 0, shown.stderr
     return shown.stdout
-
-
-class Dense(Node):
-    """Nobody's mapper, with a parameter that the mapper had once."""
-
-    @dataclass
-    class Config:
-        density: int = 1
-
-    def on_fused(self, keyframe: FusedKeyframe) -> Iterator[Preview]:
-        yield from ()
 
 
 @dataclass
@@ -85,6 +70,7 @@ def test_help_has_every_parameter_with_its_type_default_and_comment() -> None:
         for word in words:
             assert word in " ".join(line.strip() for line in lines[at : at + 3])
     assert any(line.startswith("  seed=0") for line in lines)
+    assert sum("run_all.py" in line for line in lines) == 1  # who has a wheel has the command alone
     assert "The paper's parameters, where it gives them" in shown
     assert max(len(line) for line in lines if "/runs/" not in line) <= MAX_WIDTH
 
@@ -125,36 +111,3 @@ def test_every_edge_of_the_graph_is_in_its_text() -> None:
 def test_hydra_s_own_flags_work() -> None:
     assert "_target_: nodes.mapper.Mapper\n" in run_all("--cfg", "job", "mapper.window=5")
     assert "== Flags ==" in run_all("--hydra-help")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("old", "new"), RENAMED)
-def test_an_old_name_is_refused_with_the_new_one(old: str, new: str) -> None:
-    command = ["device=cpu", *(["tracker=droid", "tracker.weights=random"] if ".constants." in new else [])]
-    with pytest.raises(GraphError) as refused:
-        compose([f"{old}=1", *command])
-    assert str(refused.value) == f"{old} is {new} now"
-    slot, *keys = new.split(".")
-    there = compose(command).slots[slot].config
-    for key in keys[:-1]:
-        there = there[key]
-    assert keys[-1] in (there[0] if isinstance(there, list) else there) or keys[0] == "constants"
-
-
-def test_an_old_name_in_a_list_is_refused_too() -> None:
-    stage = "scale: 1, step: 1.0, hypotheses: 9, radius: 2"
-    with pytest.raises(GraphError, match=r"^mvs.stages.small_jump is mvs.stages.p1 now$"):
-        compose([f"mvs.stages=[{{{stage}, p1: 0.1, p2: 1.0}}, {{{stage}, small_jump: 0.1, p2: 1.0}}]", "device=cpu"])
-
-
-@pytest.mark.parametrize("old", sorted(GONE))
-def test_a_parameter_that_is_gone_is_refused_with_the_reason(old: str) -> None:
-    with pytest.raises(GraphError, match=f"{old} is gone: {GONE[old]}"):
-        compose([f"{old}=1", "device=cpu"])
-
-
-def test_a_node_of_one_s_own_may_have_a_parameter_of_an_old_name() -> None:
-    graph = compose(["mapper._target_=tests.test_help.Dense", "mapper.density=2", "evaluator._target_=null"])
-    assert graph.slots["mapper"].config == {"density": 2}
-    with pytest.raises(GraphError, match=r"mapper.unexplored: tests.test_help.Dense has no parameter 'unexplored'; it"):
-        compose(["mapper._target_=tests.test_help.Dense", "mapper.unexplored=2", "evaluator._target_=null"])

@@ -19,7 +19,7 @@ import msgs
 from bench.faults.frame_mutations import ESCAPES, frame, good, mutated, parts
 from msgs import End, Frame, SplatMap
 from msgs.codec import MAX_END_HEADER_BYTES, MAX_END_VALUES, CodecError, decode, encode
-from nodes import Stats
+from mvsgs_core.stats import Stats
 
 GOOD = bytes(encode(Frame(1, 0.5, np.zeros((4, 4, 3), np.uint8), np.ones(4))))
 MARK = "here"

@@ -71,18 +71,6 @@ def test_the_worlds_scale_does_not_matter() -> None:
     np.testing.assert_allclose(kept[0][both], kept[1][both], rtol=5e-3)
 
 
-def test_the_confidence_is_chosen_by_name() -> None:
-    confidences = []
-    for mode in ("swr", "pkrn"):
-        node = LearnedFusion(LearnedFusion.Config(confidence_mode=mode, **RANDOM))
-        views = [v for d in _depths(1.0) for v in node.on_depth(d)] + list(node.on_end())
-        assert all((v.confidence >= 0).all() and (v.confidence <= 1).all() for v in views)
-        confidences.append(views[2].confidence)
-    assert np.abs(confidences[0] - confidences[1]).max() > 0.1
-    with pytest.raises(ValueError, match="no confidence 'nsum' of V-FUSE"):
-        LearnedFusion(LearnedFusion.Config(weights="random", confidence_mode="nsum"))
-
-
 def test_missing_weights_say_what_to_fetch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MVSGS_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

@@ -173,9 +173,9 @@ def test_the_preview_of_a_live_stream_says_how_late_it_is() -> None:
     assert 1.0 < preview.latency[0, 0] <= preview.latency[0, 1] * 1.02 < 60.0
     assert (preview.effort, preview.fusion_effort) == (2, 1)
     soon = replace(keyframe_message(7, 1.0), captured=time.time() - 0.25)
-    node._preview_seconds = 60.0
+    node._previews.seconds = 60.0
     assert list(node.on_keyframe(soon)) == []  # previews take a part of the time, and no more
-    node._preview_seconds = 0.0
+    node._previews.seconds = 0.0
     list(node.on_keyframe(soon))
     shown = node.stats.values["latency"]["keyframe to preview"]  # its coarse depth stands in
     assert shown["count"] == 2

@@ -12,6 +12,7 @@ import pytest
 from launch.compose import compose
 from launch.inline import run_inline
 from msgs import Depth, FusedKeyframe, Keyframe, SplatMap, Trajectory
+from tests.support.gpu import GPU
 
 pytestmark = pytest.mark.slow
 
@@ -22,18 +23,19 @@ PATH = [
     "mvs=mvsformer", "mvs.weights=random", "mvs.network_area=4096", "mvs.area=1300", "mvs.ranges.min_cells=1",
     "depth_fusion=vfuse", "depth_fusion.weights=random", "depth_fusion.confidence=0", "depth_fusion.check=false",
     "mapper=paper", "mapper.iterations=2", "mapper.refinement=4",
-    "dataset=synthetic", "dataset.size=[120,160]", "dataset.options.frames=60", "dataset.stop=8", "device=cpu",
+    "dataset=synthetic", "dataset.size=[120,160]", "dataset.options.frames=60", "dataset.stop=8",
     "evaluator.lpips=off", "evaluator.max_frames=6",
 ]  # fmt: skip
 
 
-def test_the_papers_path_runs_to_a_map_and_says_that_it_is_noise(tmp_path: Path) -> None:
+@pytest.mark.parametrize("device", ["cpu", GPU])
+def test_the_papers_path_runs_to_a_map_and_says_that_it_is_noise(device: str, tmp_path: Path) -> None:
     sent: dict[type, list[Any]] = {}
 
     def observe(slot: str, node: object, message: Any) -> None:
         sent.setdefault(type(message), []).append(message)
 
-    run_inline(compose([*PATH, f"output={tmp_path}"]), observe)
+    run_inline(compose([*PATH, f"device={device}", f"output={tmp_path}"]), observe)
     keyframes, depths, views = (sent[kind] for kind in (Keyframe, Depth, FusedKeyframe))
     assert len(keyframes) == len(depths) == len(views) >= 5
     (track,) = sent[Trajectory]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -25,6 +26,9 @@ from msgs import (
 from mvsgs_core import geometry
 from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.datasets import Item, open_dataset
+from mvsgs_core.datasets.calibration import lens_from_option
+from mvsgs_core.datasets.framing import Framing
+from mvsgs_core.export.source_camera import PHOTOGRAPHS
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.photographs.config import PhotographsConfig
 from nodes import handlers, outputs
@@ -136,6 +140,7 @@ def test_any_order_and_an_unknown_focal_length() -> None:
     keyframe = next(m for m in sent if isinstance(m, Keyframe))
     assert abs(keyframe.intrinsics[0] / items[keyframe.index].intrinsics[0] - 1.0) < 0.03
     assert node.stats.counts["keyframes"] == sum(isinstance(m, Keyframe) for m in sent)
+    assert node.stats.values[PHOTOGRAPHS][0] == trajectory.focal_factor
 
 
 def test_photographs_of_nothing_say_so() -> None:
@@ -156,7 +161,7 @@ def test_photographs_of_nothing_say_so() -> None:
 
 
 @pytest.mark.slow
-def test_three_photographs_are_enough_and_none_of_them_is_held_out() -> None:
+def test_three_photographs_are_enough() -> None:
     _, sent, _ = run(fountain()[:3])
     trajectory = sent[-1]
     assert isinstance(trajectory, Trajectory)
@@ -223,3 +228,20 @@ def test_lenses_that_differ_take_no_more_memory_and_are_told_once(monkeypatch: p
         assert lens.image(image).shape == image.shape
     assert len(node._lenses) == KEPT
     assert sum("distorted" in text for text in node.stats.warnings) == 1
+
+
+def test_the_lens_that_is_told_is_the_one_to_give_in_pixels_of_the_original_photographs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Read with it, the photographs come as they leave here."""
+    node = PhotographsTracker()
+    monkeypatch.setattr(node.core, "keyframe_lens", lambda index: (1.2, -0.1, 0.02))
+    original, size, delivered = np.array([150.0, 150.0, 95.5, 71.5]), (144, 192), (48, 64)
+    image, came = np.zeros((*delivered, 3), np.uint8), scale_intrinsics(original, size, delivered)
+    found = node._undistortion(Frame(0, 0.0, image, came, True, original_intrinsics=original))
+    (warning,) = node.stats.warnings
+    intrinsics, distortion = ([float(v) for v in text.split(",")] for text in re.findall(r"=\[(.+?)\]", warning))
+    assert intrinsics == [180.0, 180.0, 95.5, 71.5]
+    lens, _ = lens_from_option(intrinsics, distortion, size)
+    read = Framing(delivered).image(np.zeros((*size, 3), np.uint8), lens, delivered)[1]
+    np.testing.assert_allclose(read, found.intrinsics, rtol=0.01)

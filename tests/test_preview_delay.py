@@ -20,14 +20,14 @@ def test_a_keyframe_counts_as_shown_once_whether_it_was_read_without_its_depth_o
         return int(node.stats.values["latency"]["keyframe to preview"]["count"])
 
     list(node.on_fused_keyframe(fused(0)))
-    node._preview_seconds = 0.0
+    node._previews.seconds = 0.0
     newest = replace(keyframe_message(40, 1.0), captured=time.time() - 1.0)  # those before it were not read
     list(node.on_keyframe(newest))
     assert shown() == 2
     for index in (10, 20, 30, 40):
-        node._preview_seconds = 0.0
+        node._previews.seconds = 0.0
         list(node.on_fused_keyframe(fused(index)))
     assert shown() == 5
-    node._preview_seconds = 0.0
+    node._previews.seconds = 0.0
     list(node.on_keyframe(newest))  # late
     assert shown() == 5

@@ -15,6 +15,7 @@ from launch.jobs import Job, refused, run
 from launch.named_input import with_named_input
 from launch.output import Output
 from launch.refusal import GraphError
+from launch.specs import check_addresses
 from launch.sweep import check_launcher
 from tests.support.dataset_folders import write_image, write_photos, write_tum
 
@@ -146,10 +147,15 @@ def test_a_socket_path_that_is_too_long_leaves_the_results_too(
     tmp_path: Path, said: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fill(tmp_path)
-    monkeypatch.setattr(run_directory, "LONGEST_SOCKET_PATH", 20)
+    monkeypatch.setattr(run_directory, "IPC_PATH_BYTES", 20)
     assert "set TMPDIR to a shorter one" in said("photos", "output=out")
     assert not (tmp_path / "out").exists()
     run_directory.base_directory(compose(["transport=tcp", "port=1"]))  # has no such path
+
+
+@pytest.mark.parametrize("host", ["127.0.0.2", "[::1]", "localhost"])
+def test_any_address_of_this_machine_alone_needs_no_keys(host: str) -> None:
+    check_addresses(compose(["transport=tcp", f"host='{host}'"]))
 
 
 @pytest.mark.parametrize("name", ["2024", "2024_01_01", "true", "1.50"])
@@ -181,7 +187,7 @@ def test_a_refinement_on_ray_needs_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     graph = compose(["refine=ray", "refine.address=10.0.0.1:6379"])
     config = graph.slots["mapper"].parameters
     assert (config.refine.by, config.refine.address) == ("ray", "10.0.0.1:6379")
-    with pytest.raises(ValueError, match=r"pip install 'mvsgs\[ray\]'"):
+    with pytest.raises(ValueError, match=r"pip install 'ray>=2\.40'"):
         graph.slots["mapper"].node.check(config)
     with pytest.raises(GraphError, match="must name the cluster"):
         compose(["refine=ray", "refine.address=auto"])
@@ -192,7 +198,7 @@ def test_a_refinement_on_ray_needs_ray(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_sweep_on_slurm_needs_its_launcher(monkeypatch: pytest.MonkeyPatch) -> None:
     words = ["-m", "hydra/launcher=submitit_slurm", "mapper.iterations=1,2"]
     monkeypatch.setattr("launch.sweep.importlib.util.find_spec", lambda name: None)
-    with pytest.raises(GraphError, match=r"pip install 'mvsgs\[slurm\]'"):
+    with pytest.raises(GraphError, match=r"pip install 'hydra-submitit-launcher>=1\.2'"):
         check_launcher(words)
     monkeypatch.setattr("launch.sweep.importlib.util.find_spec", lambda name: name)
     monkeypatch.setattr("launch.sweep.shutil.which", lambda name: None)

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import zmq
@@ -70,6 +71,26 @@ def test_reader_passes_options_on(tmp_path: Path) -> None:
     assert [(m.index, m.timestamp, m.image[0, 0, 0]) for m in messages[::2]] == [(0, 1.0, 22), (1, 2.5, 25)]
     assert messages[1].world_from_cam is None
     assert messages[1].depth is None
+
+
+@pytest.mark.parametrize("name", ["images", "video"])
+def test_frames_say_the_intrinsics_of_the_original_images(name: str, tmp_path: Path) -> None:
+    """In whose pixels `dataset.intrinsics` is."""
+    path, given = tmp_path / "walk.avi", [50.0, 52.0, 31.0, 24.0]
+    if name == "images":
+        path = write_photos(tmp_path / "photos")
+    else:
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 20.0, (64, 48))
+        for number in range(3):
+            writer.write(np.full((48, 64, 3), 80 * number, np.uint8))
+        writer.release()
+    config = Reader.Config(name=name, path=str(path), size=[24, 32], intrinsics=given, distortion=[-0.1, 0.0, 0.0, 0.0])
+    for message in Reader(config).run():
+        if isinstance(message, Frame):
+            assert message.image.shape == (24, 32, 3)
+            assert message.intrinsics[0] < 30.0
+            assert message.original_intrinsics is not None
+            assert message.original_intrinsics.tolist() == given
 
 
 def test_reader_can_play_at_the_recorded_rate(tmp_path: Path) -> None:

@@ -59,3 +59,13 @@ def test_a_node_cannot_be_told_to_stop_so_often_that_it_never_does(launch: type[
         time.sleep(0.1)
     assert not lives(relay)
     assert run.finish()[0] == 1
+
+
+@pytest.mark.skipif(signal.getsignal(signal.SIGHUP) == signal.SIG_IGN, reason="these outlive their terminal: nohup")
+def test_a_run_ends_with_its_terminal(launch: type[Launch]) -> None:
+    run = launch(*STREAM)
+    run.wait_until_running()
+    run.process.send_signal(signal.SIGHUP)
+    assert run.goes_down()
+    code, out, _ = run.finish()
+    assert (code, "stopped by SIGHUP" in out) == (128 + signal.SIGHUP, True)

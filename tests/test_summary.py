@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from launch.summary import _figures
+from launch.output import RESULTS
+from launch.summary import FILES, _figures
 from mvsgs_core.evaluation.scoring import Score, summarize
+from mvsgs_core.kept_map import FOLDER
 
 
 def report(after: list[Score], before: list[Score]) -> dict[str, Any]:
@@ -54,3 +56,7 @@ def test_a_map_that_was_never_refined_has_a_worst_frame_too() -> None:
 def test_a_report_of_nothing_is_no_error() -> None:
     assert not [line for line in _figures(report([], [])) if line.startswith("worst")]
     assert _figures({"finished": False, "reason": "stopped"}) == []
+
+
+def test_every_result_is_named_where_it_is_there() -> None:
+    assert set(RESULTS) - {FOLDER} <= set(FILES)

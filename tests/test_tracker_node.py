@@ -218,7 +218,9 @@ def test_a_guessed_focal_length_is_estimated_and_sent() -> None:
     node = Tracker()
     sent = []
     for frame in frames:
-        sent += list(node.on_frame(Frame(frame.index, frame.timestamp, frame.image, frame.intrinsics * wrong, True)))
+        given, original = frame.intrinsics * wrong, frame.intrinsics * wrong * 3.0
+        shrunk = Frame(frame.index, frame.timestamp, frame.image, given, True, original_intrinsics=original)
+        sent += list(node.on_frame(shrunk))
     sent += list(node.on_end())
     trajectory = sent[-1]
     assert isinstance(trajectory, Trajectory)
@@ -230,6 +232,8 @@ def test_a_guessed_focal_length_is_estimated_and_sent() -> None:
             keyframe.intrinsics[:2], trajectory.focal_factor * wrong[:2] * frames[0].intrinsics[:2]
         )
     assert node.stats.counts["focal length over its guess"] == trajectory.focal_factor
+    told = node.stats.values["focal_px"]  # as `dataset.intrinsics` is given
+    assert told == pytest.approx(3.0 * wrong[0] * frames[0].intrinsics[0] * trajectory.focal_factor)
 
 
 def test_a_stream_of_nothing_ends_with_an_empty_trajectory() -> None:
@@ -348,7 +352,7 @@ def test_gps_goes_with_the_trajectory() -> None:
 
 
 def test_true_poses_that_hardly_move_say_what_to_lower() -> None:
-    frames, truths = messages(3)
+    frames, truths = messages(2)
     node = PosedTracker()
     for frame, truth in zip(frames, truths):
         list(node.on_frame(frame))

@@ -16,7 +16,8 @@ from mvsgs.view import SavedMapView
 from mvsgs_core.export.cameras import read_cameras, write_cameras
 from mvsgs_core.export.ply import read_ply, write_ply
 from mvsgs_core.export.snapshot import Snapshot
-from mvsgs_core.mapping.preview import as_bytes, covariances
+from mvsgs_core.mapping.preview import covariances
+from mvsgs_core.rasterizer.interface import as_bytes
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 from nodes.map_page import MapPage
 from nodes.viewer import Viewer

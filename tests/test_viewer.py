@@ -21,8 +21,8 @@ import pytest
 import torch
 
 from msgs import Preview, SplatMap, TrackerPhase
-from mvsgs_core.mapping.preview import as_bytes
 from mvsgs_core.photometry import vignetting_factor
+from mvsgs_core.rasterizer.interface import as_bytes
 from mvsgs_core.rasterizer.kernels import gaussian_std_ratio
 from nodes import handlers, outputs
 from nodes.splat_map import splat_map
@@ -292,7 +292,7 @@ def test_the_refined_map_is_shown_whole_and_rendered(viewer: Viewer) -> None:
 
 def test_shapes_of_a_refined_map_become_scales(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[np.ndarray] = []
-    monkeypatch.setattr(viewer, "_show_splats", lambda means, covariances, *_: shown.append(covariances))
+    monkeypatch.setattr(viewer, "_show_splats", lambda covariances, **_: shown.append(covariances))
     plain = replace(final_map(), world_from_cam=poses_around([0.0]))
     shaped = replace(plain.splats, betas=torch.full_like(plain.splats.betas, 4.0))
     for final in (plain, replace(plain, splats=shaped, kernel="exact")):

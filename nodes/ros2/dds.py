@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 from weakref import WeakValueDictionary
 
+import psutil
 from cyclonedds._clayer import ddspy_take, ddspy_write
 from cyclonedds.core import DDSException, InstanceState, Policy, Qos, ReadCondition, SampleState, ViewState, WaitSet
 from cyclonedds.domain import Domain, DomainParticipant
@@ -41,7 +42,7 @@ _BLOCKED = 100  # ms that a writer waits for a slow reader before it goes on wit
 _EVERYTHING = SampleState.Any | ViewState.Any | InstanceState.Any
 _TAKEN = 64  # samples at once
 _SO_MEMINFO, _MEMINFO, _ROOM, _DROPS = 55, "9I", 1, 8  # linux/sock_diag.h; Python's socket does not name it
-_SIOCGIFADDR, _NAME = 0x8915, 16  # linux/sockios.h; bytes of a device's name
+_NAME = 16  # bytes of a device's name
 _IDL = {
     "?": bool, "u1": types.uint8, "i4": types.int32, "u4": types.uint32, "f8": types.float64,
     "i8": types.int64, "u8": types.uint64,
@@ -295,22 +296,10 @@ def _device(interface: str) -> str | None:
         return interface.partition(":")[0]  # eth0:1 is a further address of eth0
     if address.is_loopback:
         return LOOPBACK
-    for _, name in socket.if_nameindex():
-        if _first_address(name) == address:
-            return name
-    raise DdsError(f"interface={interface}: no device has it as its first address; give the device's name (ip addr)")
-
-
-def _first_address(device: str) -> ipaddress.IPv4Address | None:
-    """None where it has none."""
-    import fcntl  # not on Windows
-
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
-        try:
-            told = fcntl.ioctl(asking, _SIOCGIFADDR, struct.pack("256s", os.fsencode(device)))
-        except OSError:
-            return None
-    return ipaddress.IPv4Address(told[20:24])  # of struct ifreq: the name, then the family, port and address
+    for name, told in psutil.net_if_addrs().items():
+        if str(address) in [each.address for each in told]:
+            return str(name).partition(":")[0]
+    raise DdsError(f"interface={interface}: no device has that address; give the device's name (ip addr)")
 
 
 def _bind(descriptor: int, device: str) -> None:

@@ -41,10 +41,6 @@ class Time:
     def nanoseconds(self) -> int:
         return self.sec * 10**9 + self.nanosec
 
-    @property
-    def seconds(self) -> float:
-        return self.sec + 1e-9 * self.nanosec
-
 
 @dataclass(frozen=True)
 class Header:

@@ -12,8 +12,6 @@ from __future__ import annotations
 import gc
 import logging
 import queue
-import random
-import sys
 import threading
 import time
 import traceback
@@ -22,8 +20,6 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 import msgs
 from msgs import Frame, Message
@@ -35,7 +31,7 @@ from nodes.runtime.explained import is_explained
 from nodes.runtime.freed_memory import FreedMemory
 from nodes.runtime.inbox import Inbox, Reader
 from nodes.runtime.requests import Requests
-from nodes.runtime.runner import Runner, end_of, stats_of
+from nodes.runtime.runner import Runner, end_of, seed, stats_of
 from nodes.runtime.signals import ABORT_SECONDS, Signals, Stopped, end_within
 from nodes.runtime.spec import Input, Spec
 from nodes.runtime.status import Status, peak_bytes
@@ -118,7 +114,7 @@ class _Process:
         self.status.set("starting")
         node_type = load_node(self._spec.target)
         self._is_source = is_source(node_type)
-        self._seed()
+        seed(self._spec.seed)
         config = build(node_type.Config, parameters(self._spec), self._spec.name)
         runner = self._runner = Runner(self._spec.name, node_type(config))
         runner.node.rest, runner.node.waiting = self._rest, self._waiting
@@ -218,9 +214,7 @@ class _Process:
         for i in inputs:
             kind = msgs.TYPES[i.type]
             if i.best_effort:
-                reader: Reader = NewestReader(
-                    i.address, kind, topic=i.topic, late=False, observer=observer, away=i.away, **shared
-                )
+                reader: Reader = NewestReader(i.address, kind, topic=i.topic, observer=observer, away=i.away, **shared)
             else:
                 reader = ReliableReader(
                     i.address, kind, topic=i.topic, buffer=spec.buffer, observer=observer, away=i.away,
@@ -321,12 +315,6 @@ class _Process:
     def _held_back(self, topic: str) -> None:
         self._step.topic, self._step.doing = topic, "held back"  # in this order: another thread reads them
         self._signals.check()
-
-    def _seed(self) -> None:
-        random.seed(self._spec.seed)
-        np.random.seed(self._spec.seed)
-        if "torch" in sys.modules:
-            sys.modules["torch"].manual_seed(self._spec.seed)
 
     def _snapshot(self) -> dict[str, Any]:
         stats = stats_of(self._runner.node.stats) if self._runner else {}

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import random
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
+
+import numpy as np
 
 from msgs import End, Message
 from msgs.codec import MAX_END_HEADER_BYTES, MAX_HEADER_BYTES
@@ -64,6 +68,14 @@ class Runner:
                 )
             self.sent[type(message).__name__] += 1
             yield message
+
+
+def seed(number: int) -> None:
+    """For all that draws at random, so that the same run can be had again."""
+    random.seed(number)
+    np.random.seed(number)
+    if "torch" in sys.modules:
+        sys.modules["torch"].manual_seed(number)
 
 
 def own_stats(node: Node, **figures: Any) -> dict[str, Any]:

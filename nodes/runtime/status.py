@@ -7,7 +7,6 @@ import logging
 import os
 import queue
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -42,7 +41,7 @@ class Status:
             self._thread.join(LAST_WORDS)
 
     def _line(self) -> dict[str, Any]:
-        return self._state | self._snapshot() | {"cpu_seconds": time.process_time(), "bytes": rss()}
+        return self._state | self._snapshot() | {"bytes": rss()}
 
     def _write(self) -> None:
         while True:

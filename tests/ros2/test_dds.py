@@ -7,11 +7,12 @@ import socket
 import subprocess
 import sys
 import time
-from ipaddress import ip_address
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 from nodes.ros2.connection import DEFAULT, LATCHED, LOOPBACK, SENSOR_DATA, Connection, Quality
@@ -110,15 +111,14 @@ def bound() -> dict[int, str]:
 
 def others() -> list[tuple[str, str]]:
     """Name and address of the device by which this machine reaches others; none where it reaches nobody."""
-    from nodes.ros2.dds import _first_address
-
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
         try:
             asking.connect(("192.0.2.1", 9))  # sends nothing
         except OSError:
             return []
         address = asking.getsockname()[0]
-    return [(name, address) for _, name in socket.if_nameindex() if str(_first_address(name)) == address]
+    devices = psutil.net_if_addrs().items()
+    return [(name, address) for name, told in devices if address in [each.address for each in told]]
 
 
 def test_a_device_is_known_by_its_name_and_address(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,12 +127,15 @@ def test_a_device_is_known_by_its_name_and_address(monkeypatch: pytest.MonkeyPat
     assert dds._device("auto") is None
     for loopback in (LOOPBACK, "127.0.0.1", "127.3.2.1"):
         assert dds._device(loopback) == "lo"
-    assert str(dds._first_address("lo")) == "127.0.0.1"
     assert dds._device("eth0:1") == "eth0"
-    monkeypatch.setattr(socket, "if_nameindex", lambda: [(1, "lo"), (2, "no0"), (3, "eth3")])
-    known = {"lo": ip_address("127.0.0.1"), "eth3": ip_address("10.0.0.2")}
-    monkeypatch.setattr(dds, "_first_address", known.get)
-    assert dds._device("10.0.0.2") == "eth3"
+    addresses = {
+        "lo": ["127.0.0.1"], "no0": [], "eth3": ["02:42:0a:00:00:02", "10.0.0.2", "10.0.1.2"], "eth4:1": ["10.0.2.2"],
+    }  # fmt: skip
+    known = {name: [SimpleNamespace(address=each) for each in told] for name, told in addresses.items()}
+    monkeypatch.setattr(psutil, "net_if_addrs", lambda: known)
+    for first_or_further in ("10.0.0.2", "10.0.1.2"):
+        assert dds._device(first_or_further) == "eth3"
+    assert dds._device("10.0.2.2") == "eth4"
     with pytest.raises(dds.DdsError, match=r"interface=10\.0\.0\.3.*give the device's name"):
         dds._device("10.0.0.3")
 

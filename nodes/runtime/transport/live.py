@@ -66,7 +66,7 @@ class LiveReader(NewestReader):
     def _accepts(self, frame: zmq.Frame) -> bool:
         """A frame that is no message takes no good one's place."""
         try:
-            decode(frame.buffer, expect=(self._type,), max_bytes=self._max_bytes)
+            decode(frame.buffer, expect=(self._type,))
         except CodecError:
             self.refused += 1
             return False

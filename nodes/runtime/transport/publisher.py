@@ -52,7 +52,6 @@ class Publisher:
         topic: str = "",
         buffer: int = 8,
         keys: Keys | None = None,
-        max_bytes: int | None = None,
         token: str = "",  # with which a reader's subscription must begin: who has none gets nothing
         held_back: Callable[[], None] = lambda: None,
         away: float = 0.0,  # s for which a lost reader is waited for; 0: it is an error at once
@@ -71,7 +70,6 @@ class Publisher:
         self._missing_since: float | None = None  # by time.monotonic: when a reader was lost that is not back
         self._not_sent = 0  # messages that a lost reader will get when it is back
         self._goodbyes = 0
-        self._max_bytes = max_bytes
         self._started = self._ended = False
         self._pool = FramePool()
         self._keys = keys
@@ -178,7 +176,7 @@ class Publisher:
         if self.readers[RELIABLE] > 0:
             self._send(message, sequence, RELIABLE, before)
         elif self._kept is not None:
-            self._kept.add(encode(message, sequence, before=before, delivery=RELIABLE, max_bytes=self._max_bytes))
+            self._kept.add(encode(message, sequence, before=before, delivery=RELIABLE))
         self._not_sent += 1
 
     def end(self, message: End) -> None:
@@ -219,9 +217,7 @@ class Publisher:
             buffers.append(self._pool.take(size))
             return buffers[0]
 
-        frame = encode(
-            message, sequence, before=before, delivery=delivery, max_bytes=self._max_bytes, allocate=allocate
-        )
+        frame = encode(message, sequence, before=before, delivery=delivery, allocate=allocate)
         if self._kept is not None and delivery == RELIABLE:
             self._kept.add(frame)
         self._pool.give(buffers[0], self._deliver(frame, delivery != NEWEST))

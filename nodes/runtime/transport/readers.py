@@ -48,7 +48,6 @@ class _Reader:
         topic: str = "",
         buffer: int = 8,
         keys: Keys | None = None,
-        max_bytes: int | None = None,
         token: str = "",  # of the publisher
         observer: str | None = None,  # the name of one that only observes: its loss does not concern the publisher
         away: float = 0.0,  # s for which a lost publisher is waited for: one that is started again begins anew
@@ -61,7 +60,6 @@ class _Reader:
         self._type = type
         self._keys = keys
         self._buffer = max(1, buffer)
-        self._max_bytes = max_message_bytes(type) if max_bytes is None else max_bytes
         self._frames: deque[zmq.Frame] = deque()  # taken over, not asked for yet
         self._descriptor: int | None = None  # of the connection
         self._lost_at: float | None = None
@@ -69,7 +67,7 @@ class _Reader:
         self._token, self._observer = token.encode(), observer
         self.broke = False  # the connection did, and nothing came since
         self._met = False  # the publisher let this reader in once
-        self._socket = open_socket(zmq.SUB, address, keys, self._max_bytes)
+        self._socket = open_socket(zmq.SUB, address, keys, max_message_bytes(type))
         self._socket.rcvhwm = self._buffer
         self._socket.reconnect_ivl, self._socket.reconnect_ivl_max = 50, self.longest_pause
         self.monitor = open_monitor(self._socket, self.monitored)
@@ -164,7 +162,7 @@ class _Reader:
 
     def _decode(self, frame: zmq.Frame) -> Decoded:
         try:
-            return decode(frame.buffer, expect=(self._type, End), max_bytes=self._max_bytes)
+            return decode(frame.buffer, expect=(self._type, End))
         except CodecError as error:
             raise CodecError(f"{self.topic}: {error}") from error
 
@@ -259,26 +257,9 @@ class NewestReader(_Reader):
 
     delivery = NEWEST
 
-    def __init__(
-        self,
-        address: str,
-        type: type,
-        *,
-        topic: str = "",
-        late: bool = True,  # what was sent before the first message that it gets is not "skipped"
-        keys: Keys | None = None,
-        max_bytes: int | None = None,
-        token: str = "",
-        observer: str | None = None,
-        away: float = 0.0,
-        say: Callable[[str], object] = lambda text: None,
-    ) -> None:
-        super().__init__(
-            address, type, topic=topic, buffer=2, keys=keys, max_bytes=max_bytes, token=token, observer=observer,
-            away=away, say=say,
-        )  # fmt: skip
+    def __init__(self, address: str, type: type, **options: Any) -> None:
+        super().__init__(address, type, buffer=2, **options)
         self._frames = deque(maxlen=1)  # a newer one takes the older one's place
-        self._late = late
         self._odd: deque[zmq.Frame] = deque(maxlen=1)  # what took no message's place, to be reported
         self.displaced = 0  # messages that a newer one replaced before they were taken
         self._end: zmq.Frame | None = None
@@ -340,8 +321,7 @@ class NewestReader(_Reader):
 
     def _note(self, sequence: int) -> None:
         """A message of that number was taken."""
-        if not self._late or self.expected:
-            self.skipped += max(0, sequence - self.expected)
+        self.skipped += max(0, sequence - self.expected)
         self.expected = sequence + 1
 
     def _attend(self) -> None:
