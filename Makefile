@@ -35,8 +35,8 @@ check-system:
 		|| { echo "Python's headers are missing: sudo apt install $$(basename $(PYTHON))-dev"; exit 1; }
 	@test -n "$(CXX_FOUND)" || { echo "a C++ compiler is missing: sudo apt install g++"; exit 1; }
 
-# Exact versions, all of them: constraints.txt is the complete list. PIP_FLAGS: for example, on Linux without a GPU,
-# PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu" spares gigabytes of CUDA packages.
+# Exact versions: constraints.txt is the complete list, but for the CUDA packages that PyPI's PyTorch asks for on Linux.
+# PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu" spares those gigabytes: PyTorch for CPUs alone.
 # First what compiles the kernels, then the rest. Byte code is made on all cores, where pip would use one; some packages
 # carry templates that are no Python.
 $(TOOLS): constraints.txt | check-system
@@ -45,7 +45,7 @@ $(TOOLS): constraints.txt | check-system
 	@touch $@
 
 $(PACKAGES): $(TOOLS)
-	@echo "installing packages into .venv (4.2 GB, some minutes)"
+	@echo "installing packages into .venv (some minutes; 4.2 GB, or gigabytes more with CUDA)"
 	@$(PIP) --no-compile $(PIP_FLAGS) -r constraints.txt
 	@$(BIN)/python -m compileall -q -j 0 -x '/tests?/' .venv/lib > /dev/null 2>&1 || true
 	@touch $@
