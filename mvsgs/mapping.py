@@ -12,7 +12,7 @@
 
 The nodes of a run are at work, one message at a time (launch/inline.py), so that the same frames give the same map as
 `mvsgs` does with `inline=true dataset.hide_fixed=false`: what is fixed to the camera is not looked for. Every fifth
-frame (`mvsgs_core.held_out`) is tracked and not mapped, as in every run.
+frame after the first (`mvsgs_core.held_out`) is tracked and not mapped, as in every run.
 """
 
 # ruff: noqa: E402

@@ -65,7 +65,7 @@ class PosedTracker:
         self._undecided = True  # about the unit: no two keyframes have given a depth yet
         self._complete: list[int] = []  # keyframes not given out yet
         self._tail = Tail()
-        self._poses: dict[int, np.ndarray] = {}  # (4, 4) of the frames since, in the graph's unit
+        self._poses: dict[int, np.ndarray] = {}  # (4, 4) of these, in the graph's unit
         self._between: dict[int, dict[int, _Waiting]] = {}  # by the keyframe that they were followed from
 
     def add(

@@ -60,6 +60,13 @@ def test_a_camera_that_is_known_from_a_held_out_frame_on_begins_with_the_next(fi
     assert list(tracker.graph.keyframes) == [6 if first == 5 else first]
 
 
+def test_of_a_camera_that_stands_two_poses_are_kept() -> None:
+    tracker = PosedTracker(PosedConfig(), (HEIGHT, WIDTH), INTRINSICS)
+    for index in range(12):
+        tracker.add(index, index / 30.0, view(pose(0.0, 0.0)), pose(0.0, 0.0))
+    assert set(tracker._poses) == tracker._tail.indices == {10, 11}
+
+
 def test_a_held_out_frame_that_had_to_be_a_keyframe_stays_one_where_the_camera_brakes() -> None:
     tracker = PosedTracker(PosedConfig(), (HEIGHT, WIDTH), INTRINSICS)
     for index, x in [(3, 0.0), (4, 0.15), (5, 0.35), (6, 0.36), (7, 0.37)]:
