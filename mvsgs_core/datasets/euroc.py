@@ -143,7 +143,7 @@ def _mounted(body: Path, camera: int) -> Mounted | None:
     for path, read in ((body / name / "sensor.yaml", _sensor), (kalibr, _chained)):
         if path.is_file():
             with reading(path, "is no calibration that can be used"):
-                lines = path.read_text(encoding="utf-8").splitlines()
+                lines = path.read_text(encoding="utf-8-sig").splitlines()
                 text = "\n".join(line for line in lines if not line.startswith("%"))  # OpenCV's header is no YAML
                 content = OmegaConf.to_container(OmegaConf.create(text))
                 return read(content, name)

@@ -70,7 +70,7 @@ class Images(ImageSequence):
         places = [place for place in _places(path) if place.is_dir()]
         if any(is_image(file) for place in places for file in place.iterdir()):
             return True
-        inside = path.name in _SUBFOLDERS  # with a folder of each camera in it
+        inside = path.absolute().name in _SUBFOLDERS  # with a folder of each camera in it
         scene = path.absolute().parent if inside else path
         subfolder = inside or any((path / name).is_dir() for name in _SUBFOLDERS)
         return subfolder and (find_colmap(scene) is not None or find_transforms(scene) is not None)

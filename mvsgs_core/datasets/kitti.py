@@ -108,7 +108,8 @@ def read_projection(calibration: Path, name: str, images: list[Path]) -> tuple[L
 
 def named_numbers(calibration: Path, name: str, count: int) -> np.ndarray:
     """(count,) finite float64 of the line `name: ` of a file. Raises KeyError, ValueError."""
-    lines = dict(line.split(":", 1) for line in calibration.read_text(encoding="utf-8").splitlines() if ":" in line)
+    text = calibration.read_text(encoding="utf-8-sig")
+    lines = dict(line.split(":", 1) for line in text.splitlines() if ":" in line)
     values = np.array([float(v) for v in lines[name].split()])
     if values.shape != (count,) or not np.all(np.isfinite(values)):
         raise ValueError(f"{name}: {count} finite numbers are needed")

@@ -103,7 +103,7 @@ def _check_rectified(calibration: Path, camera: int, source: Path, size: tuple[i
 def _times(path: Path, last: int) -> list[float]:
     """Seconds of the clock at which the frames from 0 on were taken, at least to the `last`. Raises BadFileError."""
     with reading(path, "must hold a time such as `2011-09-26 13:02:25.594360375` a line"):
-        lines = path.read_text(encoding="utf-8").split("\n")
+        lines = path.read_text(encoding="utf-8-sig").split("\n")
         times = [datetime.fromisoformat(line[:26]).replace(tzinfo=UTC).timestamp() for line in lines if line.strip()]
     if np.any(np.diff(times) < 0):
         raise BadFileError(f"{path} must hold times that grow")

@@ -13,6 +13,7 @@ from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.datasets import dataset
 from mvsgs_core.datasets.calibration import image_size, lens_of_matrix
 from mvsgs_core.datasets.files import Layout, natural_order, read_numbers
+from mvsgs_core.datasets.framing import same_shape
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import read_pose
 from mvsgs_core.datasets.registration import register, size_of_depth
@@ -94,7 +95,7 @@ class SevenScenes(ImageSequence):
         depth = _find_camera(folder, size) or _DEPTH_CAMERA
         if not _is_kinects(depth):  # sets that give one camera alone have depth registered to color
             return Sensor(depth)
-        if width <= _KINECT[1] and 4 * height == 3 * width:
+        if width <= _KINECT[1] and same_shape(size, _KINECT):
             return Sensor(_COLOR_CAMERA, depth, baseline=_BASELINE) if self.registered else Sensor(depth)
         if self.intrinsics is not None:
             return Sensor(_COLOR_CAMERA)

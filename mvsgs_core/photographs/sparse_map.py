@@ -200,6 +200,7 @@ class SparseMap:
             self.points /= scale
 
     def model(self) -> Model:
+        """A copy of what there is, without the observations that do not agree."""
         use, error = self._agreeing()
         names, point = np.unique(self.tracks.track[use], return_inverse=True)
         return Model(

@@ -89,6 +89,7 @@ def test_a_part_of_a_scene_has_the_model_of_the_scene(
     assert recognized(tmp_path / part) == ["images"]
     assert places(tmp_path / part) == stand
     monkeypatch.chdir(tmp_path / part)
+    assert recognized(Path()) == ["images"]
     assert places(Path()) == stand
 
 

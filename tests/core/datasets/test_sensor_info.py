@@ -149,6 +149,13 @@ def test_camera_intrinsics_of_other_cameras_than_kinect(tmp_path: Path) -> None:
         open_dataset("seven_scenes", path=folder)
 
 
+def test_smaller_copies_of_7_scenes_are_kinects_to_a_pixel(tmp_path: Path) -> None:
+    write_frames(tmp_path, (256, 341), (480, 640))
+    items = list(open_dataset("seven_scenes", path=tmp_path))
+    np.testing.assert_allclose(items[0].intrinsics[:2], [525 * 341 / 640, 525 * 256 / 480])
+    np.testing.assert_allclose(items[1].world_from_cam, pose(1) + 0.021 * np.eye(4, k=3))
+
+
 def test_images_that_are_not_kinects_are_refused_without_their_camera(tmp_path: Path) -> None:
     write_frames(tmp_path, (135, 240))
     with pytest.raises(ValueError, match=r"240x135, and those of 7-Scenes are 640x480: .*_info\.txt .* dataset\.intr"):

@@ -11,7 +11,7 @@ from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.datasets.lens import Lens
 from tests.support.dataset_folders import pose, write_depth, write_image, write_tum
-from tests.support.slam_folders import DRIFTS, write_euroc, write_kitti, write_scannet, write_tum_vi
+from tests.support.slam_folders import DRIFTS, write_euroc, write_kitti, write_kitti_raw, write_scannet, write_tum_vi
 
 
 def test_euroc(tmp_path: Path) -> None:
@@ -221,7 +221,13 @@ def test_images_that_were_scaled_after_their_calibration(tmp_path: Path) -> None
 
 def test_the_mark_that_windows_puts_before_a_text(tmp_path: Path) -> None:
     folder, drive = write_euroc(tmp_path / "euroc"), write_kitti(tmp_path / "kitti")
-    for file in (folder / "mav0/cam0/data.csv", drive / "times.txt"):
+    raw = write_kitti_raw(tmp_path / "raw")
+    cam, calibrations = folder / "mav0/cam0", raw.parent.glob("calib_*.txt")
+    for file in (cam / "data.csv", cam / "sensor.yaml", drive / "times.txt", raw / "image_02/timestamps.txt",
+                 *calibrations):  # fmt: skip
         file.write_text(file.read_text(), encoding="utf-8-sig")
+    calibration = (drive / "calib.txt").read_text()
+    (drive / "calib.txt").write_text(calibration[calibration.index("P2") :], encoding="utf-8-sig")
     assert len(open_dataset("euroc", path=folder)) == 5
     assert len(open_dataset("kitti", path=drive)) == 4
+    assert len(open_dataset("kitti_raw", path=raw)) == 3
