@@ -127,7 +127,9 @@ def camera_of(values: Mapping[str, Any]) -> SourceCamera:
             None if radial is None else (float(radial[0]), float(radial[1])),
             bool(values["reads_columns"]),
         )  # fmt: skip
-    except (KeyError, TypeError, OverflowError) as error:
+    except KeyError as error:
+        raise ValueError(f"`{error.args[0]}` is missing") from error
+    except (TypeError, OverflowError) as error:
         raise ValueError(f"{error!r}") from error
 
 

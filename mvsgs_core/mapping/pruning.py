@@ -100,8 +100,8 @@ def removal_cost(
             signed = (image.color * (counted[..., None] * signs)).sum()
             (slope,) = torch.autograd.grad(signed, [leaf], retain_graph=True)
             total += (slope / (1.0 - opacity)).to(torch.float64) ** 2 / probes  # dC/dlogit = o (1 - o) dC/do
-        # an image says nothing of what only its mask covers
-        seen += image.visible if view.valid is None else image.visible & (slope != 0)
+        # an image says nothing of what it shows behind its mask alone
+        seen += image.visible if view.valid is None else image.visible & ((slope != 0) | (image.weight_max == 0))
         del image, signed, slope  # with what the rasterizer keeps for them, which the next view takes over
     shown = (seen > 0) & (weight >= HIDDEN * opacity)
     cost = total * len(views) / seen.clamp(min=1.0)

@@ -22,7 +22,8 @@ WIDTHS = (16, 17)  # Triton compiles the loss anew for widths that 16 divides
 def warm_up(config: MapperConfig, device: torch.device) -> None:
     """Trains a map of one splat, of this configuration, as the stream will train its own.
 
-    A loss of the user's own is left out, which may do more than that. Where Triton does not render, nothing is done.
+    A loss of the user's own is left out, which may do more than that, and a rolling shutter, which is not known of yet.
+    Where Triton does not render, nothing is done.
     """
     if chosen_backend(config.training.backend, device) != "triton":
         return

@@ -118,8 +118,8 @@ def refined(job: Job, config: MapperConfig) -> Iterator[Result | None]:
     arrays, log = Arrays(job.arrays), Stats()
     photometry = photometry_of(arrays.of("photometry"))
 
-    def image(name: str, device: torch.device) -> tuple[Tensor, Tensor | None]:
-        return image_of(job.images[name] if name else NO_IMAGE, device)
+    def image(name: str) -> tuple[Tensor, Tensor | None]:
+        return image_of(job.images[name] if name else NO_IMAGE)
 
     mapper = unpack(job.meta["mapper"], arrays.of("map"), config, log, {}, photometry, image)
     home, state = set(job.meta["home"]), mapper.state

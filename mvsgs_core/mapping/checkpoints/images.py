@@ -44,13 +44,13 @@ def write_image(folder: Path, view: TrainingView, name: str, *, sync: bool) -> N
         aside.write_bytes(data.tobytes())
 
 
-def read_image(folder: Path, name: str, device: torch.device) -> tuple[Tensor, Tensor | None]:
+def read_image(folder: Path, name: str) -> tuple[Tensor, Tensor | None]:
     """A keyframe's image (H, W, 3) uint8 and its valid pixels (H, W) bool, None where all are; no name: empty.
 
     Raises ValueError for an image that is missing, damaged or another than its name says.
     """
     if not name:
-        return torch.zeros((0, 0, 3), dtype=torch.uint8, device=device), None
+        return torch.zeros((0, 0, 3), dtype=torch.uint8), None
     if not NAME.fullmatch(name):
         raise ValueError(f"{name!r} is no name of a keyframe's image")
     try:
@@ -63,13 +63,13 @@ def read_image(folder: Path, name: str, device: torch.device) -> tuple[Tensor, T
     pixels = cv2.cvtColor(found, cv2.COLOR_BGRA2RGBA if found.shape[2] == 4 else cv2.COLOR_BGR2RGB)
     if f"{_checksum(pixels):08x}" != name[-12:-4]:
         raise ValueError(f"{folder / name} is damaged: it shows something else than its name says")
-    return image_of(pixels, device)
+    return image_of(pixels)
 
 
-def image_of(pixels: np.ndarray, device: torch.device) -> tuple[Tensor, Tensor | None]:
+def image_of(pixels: np.ndarray) -> tuple[Tensor, Tensor | None]:
     """The image (H, W, 3) and its valid pixels (H, W) bool, None where all are, of what `pixels_of` gave."""
-    image = torch.from_numpy(np.array(pixels[..., :3], order="C")).to(device)
-    return image, torch.from_numpy(pixels[..., 3] > 0).to(device) if pixels.shape[2] == 4 else None
+    image = torch.from_numpy(np.array(pixels[..., :3], order="C"))
+    return image, torch.from_numpy(pixels[..., 3] > 0) if pixels.shape[2] == 4 else None
 
 
 def pixels_of(view: TrainingView) -> np.ndarray:

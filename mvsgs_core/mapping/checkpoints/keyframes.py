@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from mvsgs_core.array_file import Arrays
 from mvsgs_core.geometry import twist_scaled
@@ -33,11 +32,11 @@ class KeptKeyframe:
 
     def image(self) -> np.ndarray | None:
         """(H, W, 3) uint8 RGB as it is trained on; None: let go. Raises ValueError for a damaged file."""
-        return read_image(self.folder, self.name, torch.device("cpu"))[0].numpy() if self.name else None
+        return read_image(self.folder, self.name)[0].numpy() if self.name else None
 
     def mask(self) -> np.ndarray | None:
         """(H, W) bool, False where a pixel is not trained on; None: all are. Raises ValueError for a damaged file."""
-        valid = read_image(self.folder, self.name, torch.device("cpu"))[1] if self.name else None
+        valid = read_image(self.folder, self.name)[1] if self.name else None
         return None if valid is None else valid.numpy()
 
 

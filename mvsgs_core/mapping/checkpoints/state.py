@@ -112,7 +112,7 @@ def pack(
 
 def unpack(
     meta: Any, arrays: Arrays, config: MapperConfig, log: Stats, corrections: Corrections, photometry: ImageFormation,
-    image: Callable[[str, torch.device], tuple[torch.Tensor, torch.Tensor | None]],
+    image: Callable[[str], tuple[torch.Tensor, torch.Tensor | None]],
 ) -> OnlineMapper:  # fmt: skip
     """The mapper that was packed. image: a keyframe's by its name, as `read_image`. Raises ValueError for damage.
 
@@ -222,12 +222,12 @@ def keyframe_rows(
 
 
 def _view(
-    row: dict[str, Any], device: torch.device,
-    image: Callable[[str, torch.device], tuple[torch.Tensor, torch.Tensor | None]], kind: type[V],
+    row: dict[str, Any], device: torch.device, image: Callable[[str], tuple[torch.Tensor, torch.Tensor | None]],
+    kind: type[V],
 ) -> V:  # fmt: skip
     """With its image, which the row, kept by whoever has it, must not hold, on the CPU."""
     row = dict(row)
-    row["image"], row["valid"] = image(row.pop("file"), torch.device("cpu"))
+    row["image"], row["valid"] = image(row.pop("file"))
     row["image_size"] = tuple(row["image_size"].tolist())
     row["measured"] = None if np.isnan(row["measured"]).any() else row["measured"]
     row["exposure"] = exposure_of(row["measured"], device)

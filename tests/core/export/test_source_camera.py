@@ -116,16 +116,19 @@ def test_it_comes_back_from_cameras_json_and_is_no_keyframe(tmp_path: Path) -> N
     assert read_source_camera(path) is None
 
 
-@pytest.mark.parametrize(
-    "change", [{"origin": "x"}, {"intrinsics": [1, 2, 3]}, {"focal_sigma": -1}, {"doubt": None}, {"radial": [1]}]
-)
+@pytest.mark.parametrize("change", [{"origin": "x"}, {"intrinsics": [1, 2, 3]}, {"focal_sigma": -1}, {"radial": [1]}])
 def test_damage_is_named(tmp_path: Path, change: dict[str, Any]) -> None:
     path = tmp_path / "cameras.json"
     write_cameras(path, cameras_around([0.0]), SourceCamera(PHONE, "given"))
     content = json.loads(path.read_text())
     content["camera"] |= change
-    if change == {"doubt": None}:
-        del content["camera"]["doubt"]
     path.write_text(json.dumps(content))
     with pytest.raises(ValueError, match=r"cameras\.json: `camera`: "):
         read_source_camera(path)
+
+
+def test_what_is_missing_is_named() -> None:
+    values = camera_values(SourceCamera(PHONE, "given"))
+    for name in values:
+        with pytest.raises(ValueError, match=f"^`{name}` is missing$"):
+            camera_of({key: value for key, value in values.items() if key != name})

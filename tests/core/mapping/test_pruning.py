@@ -131,6 +131,23 @@ def test_one_of_the_walls_own_color_goes_one_of_another_and_one_behind_stay() ->
     assert len(state) == 318 - removed == len(state.anchors) == len(state.first["means"])
 
 
+def test_a_mask_that_covers_nothing_changes_no_cost() -> None:
+    """Not even of a splat that is hidden in one image and shown in the other."""
+    splats = wall_with(*[(depth, 0.97, 0.5) for depth in (1.6, 1.7, 1.8, 1.9)], (3.0, 0.9, 0.1))
+    splats.log_scales[315:-1] = 0.0  # wide ones before the last
+    behind = np.diag([-1.0, 1.0, -1.0, 1.0])
+    behind[2, 3] = 5.0
+    before, other = images(splats, (0.0, 0.0))
+    views = [before, replace(other, local_from_cam=behind)]
+    masked = [replace(view, valid=torch.ones(SIZE, dtype=torch.bool)) for view in views]
+    (plain, _), (covered, _) = (
+        removal_cost(state_of(splats), given, photograph, torch.Generator().manual_seed(0)) for given in (views, masked)
+    )
+    assert photograph(splats, before).weight_max[-1] == 0
+    assert torch.isfinite(plain[-1])
+    assert torch.equal(plain, covered)
+
+
 @pytest.mark.usefixtures("exact")
 def test_no_more_goes_than_the_error_allows() -> None:
     """Of splats that lie apart, costs add up; the fainter, the cheaper."""
