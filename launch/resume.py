@@ -58,8 +58,14 @@ def resumed_config(folder: Path, overrides: Sequence[str], conf: Path = CONF) ->
 
 
 def leave_out_refused(config: DictConfig) -> list[str]:
-    """Turns off what only observes and cannot run again, such as a recorder whose file is there; says so."""
-    graph = graph_of(config, (), {})
+    """Turns off what only observes and cannot run again, such as a recorder whose file is there; says so.
+
+    Raises GraphError for what no longer makes a graph, such as a parameter that this version does not have.
+    """
+    try:
+        graph = graph_of(config, (), {})
+    except GraphError as error:
+        raise GraphError(f"{WORD}{config.output}: {error}") from error
     notes = []
     for name in graph.observers:
         slot = graph.slots[name]

@@ -45,6 +45,7 @@ class LiveSource(Node, ABC):
         self._camera_mask = camera_mask(self.config.mask)
         for note in [] if self._camera_mask is None else self._camera_mask.notices:
             self.stats.warn(note)
+        self._told_before = len(self.stats.warnings)  # of the mask, not of the stream
 
     def run(self) -> Iterator[Frame | GroundTruth]:
         """Ends where the stream does, and when nothing comes any more, so that a session still finishes its map."""
@@ -85,7 +86,8 @@ class LiveSource(Node, ABC):
                 return usable
         silence = f"{self._silence} for {self.config.timeout:g} s"
         if first:
-            raise TimeoutError(f"{silence}: {self.stats.warnings[-1] if self.stats.warnings else self._hint()}")
+            told = self.stats.warnings[self._told_before :]
+            raise TimeoutError(f"{silence}: {self._frames.refused or next(iter(told), self._hint())}")
         self.stats.warn(f"{silence}: the stream ends here")
         return None
 

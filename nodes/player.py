@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from msgs import Frame, GroundTruth
 from msgs.codec import MAX_MESSAGE_BYTES, VersionError, decode
 from mvsgs_core.bad_file import BadFileError, brief
@@ -107,6 +109,7 @@ class Player(Node):
             message = decode(record.data, expect=PLAYED).message
             assert isinstance(message, PLAYED)
             check_intrinsics(message.intrinsics, (message.image.shape[0], message.image.shape[1]))
+            _check_original(message)
             if not math.isfinite(message.timestamp):
                 raise ValueError(f"at {message.timestamp} s")
         except VersionError as error:
@@ -117,6 +120,13 @@ class Player(Node):
             recording.leave_out(f"{record.topic} {record.sequence}: {brief(error)}")
             return None
         return message
+
+
+def _check_original(message: Frame | GroundTruth) -> None:
+    """Raises ValueError for intrinsics of an original image, of a size that is not known, that no camera has."""
+    original = message.original_intrinsics if isinstance(message, Frame) else None
+    if original is not None and not (np.isfinite(original).all() and (original[:2] > 0.0).all()):
+        raise ValueError(f"original intrinsics {original.tolist()}")
 
 
 class _Pairs:

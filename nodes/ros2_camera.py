@@ -195,7 +195,8 @@ class Ros2Camera(LiveSource):
     def _lens_for(self, native: tuple[int, int]) -> Lens | None:
         """The lens of the stream; None as long as its CameraInfo is waited for."""
         if self._lens is None:
-            self._lens = self._given_lens(native) or self._calibrated_lens(native) or self._guessed_lens(native)
+            lens = self._given_lens(native) or self._calibrated_lens(native) or self._guessed_lens(native)
+            self._lens = lens.at(native) if lens is not None and same_shape(native, lens.size) else lens
         if self._lens is None:
             self.stats.count("before_calibration")
         else:

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from msgs import Frame
+from mvsgs_core.printable import printable
 from mvsgs_core.stats import Stats
 from mvsgs_core.stream_times import LATEST, StreamTimes
 
@@ -30,6 +31,7 @@ class StreamFrames:
 
     def __init__(self, stats: Stats, sender: str, stamped: bool = True) -> None:
         self.native: tuple[int, int] | None = None  # (height, width) of all, once the first has come
+        self.refused = ""  # why the first frame that was left out was
         self.heard = 0.0  # by time.monotonic: when the last frame came that was no damaged or foreign one
         self._stats = stats
         self._sender = sender
@@ -58,6 +60,7 @@ class StreamFrames:
 
     def refuse(self, why: str) -> None:
         """One that was left out."""
+        self.refused = self.refused or printable(why)
         self._stats.count("unusable")
         self._stats.warn(why)
 

@@ -239,10 +239,13 @@ def test_a_message_that_is_none_is_left_out(tmp_path: Path) -> None:
     recorder = Recorder(Recorder.Config(str(tmp_path / "b.mcap")))
     for intrinsics in ([2, 2, 2, 2], [2, 2, 1e9, 2], [0, 2, 2, 2], [np.nan, 2, 2, 2]):
         recorder.on_message(Frame(0, 0.0, image, np.array(intrinsics, np.float64)))
+    for original in ([8, 8, 7, 7], [np.inf, 8, 7, 7], [8, -8, 7, 7]):
+        frame = Frame(0, 0.0, image, 2 * np.ones(4), original_intrinsics=np.array(original, np.float64))
+        recorder.on_message(frame)
     list(recorder.on_end())
     impossible, kept = played(tmp_path / "b.mcap")
-    assert len(kept) == 1
-    assert "left out because they are damaged: 3 (first: Frame 1: principal point" in impossible.stats.warnings[0]
+    assert len(kept) == 2
+    assert "left out because they are damaged: 5 (first: Frame 1: principal point" in impossible.stats.warnings[0]
     player, again = played(path)
     assert [message.index for message in again] == [0, 1, 2, 3]
     assert any("left out because they are damaged: 3 (first: " in warning for warning in player.stats.warnings)

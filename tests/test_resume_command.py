@@ -171,8 +171,8 @@ def test_a_parameter_that_there_is_not_is_refused_with_the_one_that_is_meant(tmp
     config = OmegaConf.load(interrupted(tmp_path) / "config.yaml")
     config.tracker.readout = config.tracker.pop("readout_time")
     OmegaConf.save(config, tmp_path / "config.yaml")
-    with pytest.raises(GraphError, match=r"^tracker.readout: .* \(did you mean readout_time\?\)"):
-        resumed(tmp_path)
+    with pytest.raises(GraphError, match=rf"^resume={tmp_path}: tracker.readout: .* \(did you mean readout_time\?\)"):
+        leave_out_refused(resumed_config(tmp_path, ()))
 
 
 def test_keyframes_in_an_order_of_their_own_are_not_resumed(tmp_path: Path) -> None:

@@ -31,9 +31,9 @@ def node(infos: list[CameraInfo], **other: Any) -> Ros2Camera:
     return camera
 
 
-def image(seconds: int) -> bytes:
-    pixels = np.full(24 * 32, 50, np.uint8)
-    return encode(Image(Header(Time(seconds, 0), "camera"), 24, 32, "mono8", 0, 32, pixels))
+def image(seconds: int, height: int = 24, width: int = 32) -> bytes:
+    pixels = np.full(height * width, 50, np.uint8)
+    return encode(Image(Header(Time(seconds, 0), "camera"), height, width, "mono8", 0, width, pixels))
 
 
 def test_a_distortion_that_cannot_be_taken_out_is_refused() -> None:
@@ -43,6 +43,15 @@ def test_a_distortion_that_cannot_be_taken_out_is_refused() -> None:
     assert camera.stats.counts["refused_calibrations"] == 1
     assert frame is not None
     assert camera._framed(frame).image.shape == (24, 32, 3)
+
+
+def test_what_is_said_of_the_lens_is_in_pixels_of_the_images() -> None:
+    """As `dataset.intrinsics` is given, of whatever size the calibration is for."""
+    camera = node([info(0.0)])
+    frame = camera._frame(image(7, 48, 64))
+    assert frame is not None
+    assert camera.stats.values["lens"]["size"] == [48, 64]
+    assert camera.stats.values["lens"]["intrinsics"] == frame.intrinsics.tolist() == [50.0, 50.0, 31.5, 23.5]
 
 
 def test_such_a_distortion_holds_where_the_border_is_cut_off() -> None:
