@@ -21,6 +21,7 @@ from mvsgs_core.camera import mean_of_colors
 from mvsgs_core.rasterizer.ssim_window import C2, RADIUS, SIGMA
 
 LEVELS = 3  # halvings of the largest rectangle along an axis: of 8 pixels
+DEPTH_NOISE = 0.02  # of depth, that a surface's has anyway: nothing is split for it
 EMPTY = 1e3  # error of a pixel that the map does not show: more than any splat costs
 
 
@@ -46,6 +47,7 @@ class Split:
     sure: np.ndarray  # (H, W) bool, whose depth is known
     logarithm: np.ndarray  # (H, W) float64 of that depth, 0 of others
     angle: float  # of a pixel, radians
+    depth_noise: float  # deviation of the logarithm that depth has anyway
     price: float
 
 
@@ -62,7 +64,7 @@ def partition(
     that it must save that too, as the dissimilarity of a pixel of median contrast; the price at most once more.
 
     A splat shows the mean color of its rectangle, blended with its neighbors'. One whose known depths differ by more
-    than its side, as standard deviations of the logarithm go, lies on two surfaces and is always split.
+    than its side and their noise, as standard deviations of the logarithm go, lies on two surfaces and is always split.
     """
     size = wanted.shape
     side = 1 << LEVELS
@@ -79,6 +81,7 @@ def partition(
         sure=sure,
         logarithm=np.log(np.where(sure, np.pad(depth, beyond), 1.0), dtype=np.float64),
         angle=angle,
+        depth_noise=DEPTH_NOISE,
         price=price + min(price, noise * float(np.median(scale))),
     )
     labels, sides = native.load("mapping").partition(**vars(given), threads=torch.get_num_threads())

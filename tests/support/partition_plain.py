@@ -29,7 +29,7 @@ def split(given: Split) -> tuple[np.ndarray, np.ndarray]:
         count, nothing, number, first, second = sums[key]
         leaf = _distortion(given.colors, given.weight, key) + np.float32(given.price)
         variance = second / np.maximum(number, 1) - (first / np.maximum(number, 1)) ** 2
-        leaf[variance > given.angle**2 * (1 << (rows + columns))] = np.inf
+        leaf[variance > given.depth_noise**2 + given.angle**2 * (1 << (rows + columns))] = np.inf
         impossible = np.full_like(leaf, np.inf)
         options = np.stack([
             nothing,

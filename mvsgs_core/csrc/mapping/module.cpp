@@ -12,7 +12,7 @@ using Colors = Array<float, nb::shape<-1, -1, 3>>;
 using Mask = Array<bool, nb::ndim<2>>;
 using Precise = Array<double, nb::ndim<2>>;
 
-nb::tuple split(Colors colors, Image weight, Image left, Mask taken, Mask sure, Precise logarithm, double angle,
+nb::tuple split(Colors colors, Image weight, Image left, Mask taken, Mask sure, Precise logarithm, double angle, double depth_noise,
                 float price, int threads) {
     const std::size_t height = colors.shape(0), width = colors.shape(1);
     require(height % partition::kSide == 0 && width % partition::kSide == 0, "partition: sides are multiples of 8");
@@ -24,7 +24,7 @@ nb::tuple split(Colors colors, Image weight, Image left, Mask taken, Mask sure, 
     std::vector<int64_t> sides;
     {
         nb::gil_scoped_release release;
-        sides = partition::split(image, angle, price, thread_count(threads), labels.data());
+        sides = partition::split(image, angle, depth_noise, price, thread_count(threads), labels.data());
     }
     const std::size_t count = sides.size() / 2;
     return nb::make_tuple(labels, to_numpy(std::move(sides), {count, 2}));
@@ -36,6 +36,6 @@ NB_MODULE(MVSGS_MODULE, m) {
     m.doc() = "Kernels of the online mapper.";
     bind_adam(m);
     m.def("partition", &split, nb::arg("colors"), nb::arg("weight"), nb::arg("left"), nb::arg("taken"), nb::arg("sure"),
-          nb::arg("logarithm"), nb::arg("angle"), nb::arg("price"), nb::arg("threads"),
+          nb::arg("logarithm"), nb::arg("angle"), nb::arg("depth_noise"), nb::arg("price"), nb::arg("threads"),
           "Labels (H, W), -1 where there is no rectangle, and rows and columns (N, 2) of each.");
 }

@@ -45,7 +45,8 @@ struct Sums {
 
 class Splitting {
 public:
-    Splitting(const Image& image, double angle, float price) : image_(image), angle_(angle), price_(price) {
+    Splitting(const Image& image, double angle, double depth_noise, float price)
+        : image_(image), angle_(angle), depth_noise_(depth_noise), price_(price) {
         for (int rows = 0; rows <= kLevels; ++rows)
             for (int columns = 0; columns <= kLevels; ++columns) {
                 means_[key_of(rows, columns)] = mean_colors(rows, columns);
@@ -177,7 +178,7 @@ private:
         constexpr float kImpossible = std::numeric_limits<float>::infinity();
         Sums& here = sums[key_of(rows, columns)];
         const int64_t wide = image_.width >> columns, high = kSide >> rows;
-        const double spread = angle_ * angle_ * static_cast<double>(1 << (rows + columns));
+        const double spread = depth_noise_ * depth_noise_ + angle_ * angle_ * static_cast<double>(1 << (rows + columns));
         const float* halves_by_rows = rows > 0 ? sums[key_of(rows - 1, columns)].cost.data() : nullptr;
         const float* halves_by_columns = columns > 0 ? sums[key_of(rows, columns - 1)].cost.data() : nullptr;
         int8_t* choice = &choice_[key_of(rows, columns)][(top >> rows) * wide];
@@ -229,6 +230,7 @@ private:
 
     const Image& image_;
     double angle_;
+    double depth_noise_;
     float price_;
     std::array<Means, kKeys> means_;
     std::vector<Between> across_;
@@ -237,8 +239,9 @@ private:
 
 }  // namespace
 
-std::vector<int64_t> split(const Image& image, double angle, float price, int threads, int64_t* labels) {
-    Splitting splitting(image, angle, price);
+std::vector<int64_t> split(const Image& image, double angle, double depth_noise, float price, int threads,
+                           int64_t* labels) {
+    Splitting splitting(image, angle, depth_noise, price);
     Caught caught;
 #pragma omp parallel num_threads(threads)
     {

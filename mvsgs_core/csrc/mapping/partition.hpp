@@ -21,7 +21,9 @@ struct Image {
 };
 
 // Labels (height, width) of the pixels, -1 of those in no rectangle; returns rows and columns of each, one after the
-// other. angle: of a pixel, radians; price: of a splat.
-std::vector<int64_t> split(const Image& image, double angle, float price, int threads, int64_t* labels);
+// other. angle: of a pixel, radians; depth_noise: deviation of the logarithm that depth has anyway;
+// price: of a splat.
+std::vector<int64_t> split(const Image& image, double angle, double depth_noise, float price, int threads,
+                           int64_t* labels);
 
 }  // namespace partition

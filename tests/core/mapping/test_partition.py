@@ -64,11 +64,11 @@ def test_the_kernel_refuses_images_of_no_whole_rectangles() -> None:
     flat, nothing = np.zeros((8, 12), np.float32), np.zeros((8, 12), bool)
     with pytest.raises(ValueError, match="multiples of 8"):
         native.load("mapping").partition(
-            np.zeros((8, 12, 3), np.float32), flat, flat, nothing, nothing, np.zeros((8, 12)), 0.1, 0.25, 1
+            np.zeros((8, 12, 3), np.float32), flat, flat, nothing, nothing, np.zeros((8, 12)), 0.1, 0.02, 0.25, 1
         )
     with pytest.raises(ValueError, match="sizes differ"):
         native.load("mapping").partition(
-            np.zeros((8, 8, 3), np.float32), flat, flat, nothing, nothing, np.zeros((8, 12)), 0.1, 0.25, 1
+            np.zeros((8, 8, 3), np.float32), flat, flat, nothing, nothing, np.zeros((8, 12)), 0.1, 0.02, 0.25, 1
         )
 
 
@@ -138,6 +138,8 @@ def test_a_depth_edge_splits_and_a_slanted_wall_does_not() -> None:
     assert len(found) > 6 * 8
     wall = 2.0 * np.exp(ANGLE * columns) + np.zeros(SIZE)  # by 45 degrees
     assert len(split(gray, depth=wall)) == 6 * 8
+    rough = 2.0 * np.exp(0.015 * np.random.default_rng(0).standard_normal(SIZE))
+    assert len(split(gray, depth=rough)) == 6 * 8  # as stereo's noise makes it
     unknown = split(gray, depth=edge, known=columns < 29)  # what is doubtful says nothing of edges
     assert len(unknown) == 6 * 8
 
