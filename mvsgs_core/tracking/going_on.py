@@ -6,6 +6,8 @@ session begins a segment of its own, and a loop may join it later.
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 
 from mvsgs_core.tracking.estimation.calibration import LAST
@@ -30,7 +32,8 @@ def go_on(session: Session, known: KnownMap) -> None:
     graph.intrinsics, graph.vignetting = known.intrinsics.copy(), known.vignetting.copy()
     if session.calibration.readout_time is None:
         graph.readout_time, graph.reads_columns = known.readout_time, known.reads_columns
-        session.calibration.readout_of = min(len(known.keyframes), LAST)
+        parts = Counter(keyframe.segment for keyframe in known.keyframes)
+        session.calibration.readout_of = min(max(parts.values()), LAST)
     session.calibration.settled = True
     session.calibration.guessed = False
     session.calibration.of_map = True

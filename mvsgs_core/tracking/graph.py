@@ -182,9 +182,7 @@ class KeyframeGraph:
         if self.weighing:
             problem.static = np.stack([self.keyframes[index].static for index in order])
         yield
-        # The ground below a drone that takes off sets the unit; soon all may be a hundred times as far.
-        farthest = solver.min_inverse_depth * min(1.0, float(np.median(problem.inverse_depth)))
-        solution = adjust(problem, replace(solver, device=self.device, min_inverse_depth=farthest))
+        solution = adjust(problem, replace(solver.reaching(problem), device=self.device))
         if not solution.failure:
             self.intrinsics = self.intrinsics * [solution.focal_factor, solution.focal_factor, 1.0, 1.0]
             for n, index in enumerate(order):

@@ -44,6 +44,7 @@ class Initializer:
         self.matcher = matcher
         self.config = config
         self.threads = threads
+        self._guess = graph.intrinsics  # (4,) that came with the frames
         self.waiting: list[int] = []
         self._weak: dict[tuple[int, int], Matches] = {}  # of pairs of them, too few for an edge
         self.diagnosis = diagnosis
@@ -106,7 +107,7 @@ class Initializer:
             start = yield from reconstructing(self.graph, self.waiting, criteria, self.threads)
         else:
             start = yield from reconstructing_with_unknown_focal(
-                self.graph, self.waiting, criteria, focal, self.threads
+                self.graph, self.waiting, criteria, focal, self._guess, self.threads
             )
         if start.failure:
             self.diagnosis.failed(start.failure)

@@ -94,7 +94,7 @@ class PosedTracker:
                 self.graph.remove(step.reference)
                 return self._first(frame, pose)
             self._tail.add(frame, step)
-            self._poses[index] = pose
+            self._poses = {i: p for i, p in self._poses.items() if i in self._tail.indices} | {index: pose}
             self._wait(step.reference, _Waiting(frame.bare(), self._lights[-1], world_from_cam))
             return []
         return self._insert(frame, pose, {step.reference: step.matches})

@@ -121,7 +121,7 @@ class Session:
         elif last := self._tail.last(self.choice):
             self.waiting.end()
             yield whole(self._add_keyframe(*last, record_of(self.records, last[0].index)))
-            if self.phase is Phase.INITIALIZING:  # it was none, and the first keyframe of a part that does not come
+            if self.phase is Phase.INITIALIZING:  # the map contradicted it: a part of its own would begin
                 self.initializer.abandon()
         if largest := self.local_map.largest():
             self.calibration.estimate_readout(largest, LAST)

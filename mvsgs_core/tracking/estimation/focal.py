@@ -37,13 +37,18 @@ class FocalConfig:
 
 
 def reconstructing_with_unknown_focal(
-    graph: KeyframeGraph, order: list[int], criteria: ReconstructionCriteria, config: FocalConfig, threads: int
+    graph: KeyframeGraph,
+    order: list[int],
+    criteria: ReconstructionCriteria,
+    config: FocalConfig,
+    guess: np.ndarray,
+    threads: int,
 ) -> Steps[Reconstruction]:
-    """`reconstruct` from several focal lengths, each then free; the lowest cost wins and is written to the graph.
+    """`reconstructing` from several focal lengths, each then free; the lowest cost wins and is written to the graph.
 
-    In steps, between which the graph has the focal length that it had.
+    In steps, between which the graph has the focal length that it had. guess: intrinsics (4,) that came with the
+    frames; what the graph has may be far off, from another part of the map.
     """
-    guess = graph.intrinsics
     criteria = replace(criteria, certain_cost=0.0)  # with a free focal length, a wrong start can be cheap too
     best: tuple[Reconstruction, np.ndarray] | None = None
     failed: Reconstruction | None = None
@@ -93,7 +98,7 @@ def observability(graph: KeyframeGraph, members: list[int], probe: float, thread
     stays as it is. The lesser of both directions. factor: on the graph's focal length, what is taken for right."""
     problem = graph.problem(members, graph.but_first(members), set(members))
     problem.intrinsics = problem.intrinsics * [factor, factor, 1.0, 1.0]
-    solver = Solver(steps=10, robust_scale=1.0, tolerance=1e-4, threads=threads)
+    solver = Solver(steps=10, robust_scale=1.0, tolerance=1e-4, threads=threads).reaching(problem)
     here = adjust(problem, solver)
     rises = []
     for off in (1.0 - probe, 1.0 / (1.0 - probe)):
@@ -108,7 +113,8 @@ def observability(graph: KeyframeGraph, members: list[int], probe: float, thread
 def focal_of_all(graph: KeyframeGraph, members: list[int], threads: int, steps: int = 10) -> float | None:
     """Factor on the focal length that all these keyframes would rather have; None where they can't tell."""
     problem = replace(graph.problem(members, graph.but_first(members), set(members)), free_focal=True)
-    solution = adjust(problem, Solver(steps=steps, robust_scale=1.0, tolerance=1e-4, threads=threads))
+    solver = Solver(steps=steps, robust_scale=1.0, tolerance=1e-4, threads=threads).reaching(problem)
+    solution = adjust(problem, solver)
     return None if solution.failure else solution.focal_factor
 
 

@@ -6,7 +6,7 @@ residual of a cell is r = target - project(T_ij [x, y, 1, d]), T_ij = T_j T_i^-1
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -27,6 +27,13 @@ class Solver:
     tolerance: float = 1e-3  # adaptive: ends where the cost falls by less than this fraction
     threads: int = 1  # of the C++ kernel
     device: str = "cpu"  # cpu: the C++ kernel; cuda or cuda:<number>, torch: PyTorch there, or on the CPU
+
+    def reaching(self, graph: Graph) -> Solver:
+        """For a graph whose points may lie far beyond the map's unit.
+
+        The ground below a drone that takes off sets it; soon all may be a hundred times as far.
+        """
+        return replace(self, min_inverse_depth=self.min_inverse_depth * min(1.0, float(np.median(graph.inverse_depth))))
 
 
 DROID_LOCAL = Solver(steps=2, adaptive=False, lm=1e-4, ep=0.1, robust="none", min_z=0.25)

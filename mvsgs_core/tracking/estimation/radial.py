@@ -81,7 +81,7 @@ def estimate_radial(problem: Graph, threads: int) -> Radial:
     Two things make k1 uncertain: chance, and that nobody knows whether errors are as large in all of the image as it
     was taken or as it should be. Between the two the cost differs by 4 k1 r² of itself; half of that is the deviation.
     """
-    solver = Solver(steps=20, robust_scale=1.0, tolerance=1e-5, threads=threads)
+    solver = Solver(steps=20, robust_scale=1.0, tolerance=1e-5, threads=threads).reaching(problem)
     first = adjust(replace(problem, free_focal=True), solver)
     matches = int(np.count_nonzero(problem.information[:, 0]))
     radial = Radial(0.0, COMMON, 1.0, SLOPE)

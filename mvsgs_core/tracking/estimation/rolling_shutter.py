@@ -77,7 +77,8 @@ def _cost(graph: KeyframeGraph, order: list[int], readout: Readout, threads: int
         problem = graph.problem(order, set(order[1:]), set(order))
     finally:
         graph.readout_time, graph.reads_columns = before
-    solution = adjust(problem, Solver(steps=3, robust_scale=1.0, tolerance=0.0, threads=threads))
+    solver = Solver(steps=3, robust_scale=1.0, tolerance=0.0, threads=threads).reaching(problem)
+    solution = adjust(problem, solver)
     return float("inf") if solution.failure else solution.cost
 
 

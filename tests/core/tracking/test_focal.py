@@ -13,10 +13,13 @@ from mvsgs_core.datasets import Item
 from mvsgs_core.datasets.lens import guess_lens
 from mvsgs_core.datasets.synthetic import Synthetic
 from mvsgs_core.tracking.between import HELD
+from mvsgs_core.tracking.estimation import calibration
+from mvsgs_core.tracking.estimation.focal import focal_of_all, observability
 from mvsgs_core.tracking.phase import Phase
 from mvsgs_core.tracking.tracker import Tracker, TrackerConfig, Update
 from mvsgs_core.trajectory import Trajectory
 from tests.support.sequences import ate, synthetic
+from tests.support.true_maps import tie, true_graph
 
 pytestmark = pytest.mark.slow
 
@@ -159,6 +162,30 @@ def test_keyframes_of_a_part_that_was_lost_soon_go_out_when_the_next_one_tells_t
     assert list(update.keyframes[:6]) == first
     assert {tracker.keyframe(index).segment for index in update.keyframes} == {0, 1}
     assert {frame.keyframe in first for frame in update.between} == {False, True}
+
+
+def test_another_part_begins_at_the_guess_however_far_off_the_first_one_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of half of the guess, three times as much is too little."""
+    monkeypatch.setattr(calibration, "refine_focal", lambda *_: "")
+    tracker, _, _ = lost_soon(0)
+    given = tracker.session.calibration.given
+    tracker.session.graph.intrinsics = given * [0.5, 0.5, 1.0, 1.0]
+    for n, item in enumerate(room(1.3), len(tracker.session.records)):
+        tracker.add(n, n / 20.0, item.image, GUESS, guessed=True)
+        if tracker.phase is Phase.TRACKING:
+            break
+    assert tracker.focal_factor == pytest.approx(1.3 * SIZE[1] / GUESS[0], rel=0.1)
+
+
+@pytest.mark.parametrize("unit", [1.0, 2000.0])
+def test_keyframes_far_beyond_the_map_s_unit_tell_the_focal_length_as_well(unit: float) -> None:
+    frames = (0, 8, 16, 24, 32, 40)
+    graph = true_graph(*frames, unit=1.0 / unit)
+    tie(graph, *frames)
+    tie(graph, *reversed(frames))
+    graph.intrinsics = graph.intrinsics * [1.05, 1.05, 1.0, 1.0]
+    assert focal_of_all(graph, list(frames), 1, steps=30) == pytest.approx(1.0 / 1.05, rel=2e-3)
+    assert observability(graph, list(frames), 0.1, 1, 1.0 / 1.05) > 1.0
 
 
 def test_a_camera_that_never_turns_keeps_the_guess_and_says_so() -> None:

@@ -12,6 +12,7 @@ from mvsgs_core import geometry
 from mvsgs_core.array_file import read_arrays, write_arrays
 from mvsgs_core.datasets import Item
 from mvsgs_core.kept_map import STREAM
+from mvsgs_core.tracking.estimation.calibration import LAST
 from mvsgs_core.tracking.known_map import FORMAT, VERSION, WHAT, KnownMap, load
 from mvsgs_core.tracking.phase import Phase
 from mvsgs_core.tracking.places.relocalization import Relocalizer
@@ -93,6 +94,17 @@ def test_the_start_of_another_part_leaves_the_readout_time_of_the_map(
     assert tracker.session.segment > 0
     list(tracker.finish())
     assert tracker.readout_time == 0.02
+
+
+def test_a_map_of_several_parts_has_the_readout_time_of_the_largest(file: Path) -> None:
+    known = load(file).renumbered(STREAM)
+    count = len(known.keyframes)
+    assert count < LAST
+    for keyframe in known.keyframes[: count // 3]:
+        keyframe.segment = 1
+    first = back()[0]
+    session = Tracker(known=known).begin(first.image.shape[:2], first.intrinsics)
+    assert session.calibration.readout_of == count - count // 3
 
 
 def test_the_camera_is_found_and_tracked_in_the_frame_of_the_map(file: Path) -> None:
