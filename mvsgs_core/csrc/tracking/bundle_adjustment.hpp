@@ -6,7 +6,7 @@
 
 namespace mvsgs {
 
-enum class Robust : int { kNone = 0, kHuber = 1, kCauchy = 2 };
+enum class Robust : int { kNone = 0, kCauchy = 1 };
 
 // All arrays row-major; K keyframes, M cells a keyframe, E directed edges.
 struct Problem {

@@ -110,7 +110,7 @@ inline Lanes project_lanes(const EdgeView& e, const double* k, double min_z, int
 // The robust cost of lanes of squared whitened residuals. Logarithms are taken of products, 16 factors at a time.
 class RobustCost {
   public:
-    RobustCost(Robust kind, double scale) : kind_(kind), k2_(scale * scale), scale_(scale) {}
+    RobustCost(Robust kind, double scale) : kind_(kind), k2_(scale * scale) {}
 
     // Adds to the cost; returns the weight of iteratively reweighted least squares.
     vd add(vd s2) {
@@ -121,17 +121,6 @@ class RobustCost {
             product_ *= g < limit ? g : limit;
             if (++factors_ == 16) flush();
             return one / g;
-        }
-        if (kind_ == Robust::kHuber) {
-            vd w = one, c = s2;
-            for (int k = 0; k < kLanes; ++k) {
-                if (s2[k] <= k2_) continue;
-                const double s = std::sqrt(s2[k]);
-                w[k] = scale_ / s;
-                c[k] = 2.0 * scale_ * s - k2_;
-            }
-            total_ += c;
-            return w;
         }
         total_ += s2;
         return one;
@@ -151,7 +140,7 @@ class RobustCost {
     }
 
     Robust kind_;
-    double k2_, scale_;
+    double k2_;
     vd total_{}, product_ = splat(1.0);
     int factors_ = 0;
 };

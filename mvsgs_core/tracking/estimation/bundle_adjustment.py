@@ -11,7 +11,7 @@ import numpy as np
 from mvsgs_core import native
 from mvsgs_core.tracking.estimation.problem import DROID_GLOBAL, DROID_LOCAL, Graph, Solution, Solver
 
-ROBUST = {"none": 0, "cauchy": 2}  # of the kernel
+ROBUST = {"none": 0, "cauchy": 1}  # of the kernel
 
 
 def adjust(graph: Graph, solver: Solver) -> Solution:
