@@ -263,7 +263,7 @@ def identity(items: Sequence[Item]) -> str:
 def mapped(options: argparse.Namespace) -> dict[str, Scene]:
     """Those of which there are whole runs."""
     there = scenes(options)
-    wanted = options.maps or list(there)
+    wanted = there if options.quick or options.maps is None else options.maps
     return {name: there[name] for name in wanted if name in there} if options.part != "tracker" else {}
 
 

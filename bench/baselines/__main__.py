@@ -116,7 +116,7 @@ def protocol(scene: str, ours: Ours, baseline: Baseline, frames: list[int]) -> R
     height, width = next(iter(ours.frames.values())).image.shape[:2]
     text = (
         f"{len(ours.frames)} frames at {width}x{height}, {len(ours.keyframes)} of them keyframes of ours, scored on "
-        f"{len(ours.held_out)} held-out frames; COLMAP got {len(frames)} of the frames at "
+        f"{len(ours.scored)} held-out frames; COLMAP got {len(frames)} of the frames at "
         f"{baseline.size[1]}x{baseline.size[0]}"
     )
     return Row(f"{scene}: protocol", text)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.table import Row, at_most
+from bench.table import Row, at_most, skipped
 from mvsgs_core.mvs.backend import NativeBackend
 from mvsgs_core.mvs.interface import MatchingImages
 from mvsgs_core.mvs.matching_cost import CostConfig
@@ -27,7 +27,7 @@ def kernel_rows(quick: bool) -> list[Row]:
     """Processor time of one sweep, ours over the plain loops'; sizes of the default's two stages."""
     compiler = shutil.which(os.environ.get("CXX", "c++")) or shutil.which("g++") or shutil.which("clang++")
     if compiler is None:
-        return [Row("cost kernel against plain loops: skipped, no C++ compiler", None)]
+        return [skipped("cost kernel against plain loops", "no C++ compiler")]
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         library = Path(folder) / "plain.so"

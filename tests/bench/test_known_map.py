@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
+
 import numpy as np
 import pytest
 
-from bench.known_map import compared, errors
+from bench.known_map import QUICK, compared, errors, mapped
 
 RANDOM = np.random.default_rng(0)
 TRUTHS = {k: RANDOM.normal(size=3) for k in range(20)}  # ten of each half
@@ -38,3 +40,8 @@ def test_errors_are_those_of_the_chosen_frames_aligned_by_others() -> None:
     found = off(range(20), 0.0)
     found[15] = found[15] + [3.0, 0.0, 0.0]
     assert errors(found, TRUTHS, [14, 15], list(range(10))) == pytest.approx([0.0, 1.0], abs=1e-9)
+
+
+def test_the_quick_run_maps_its_own_scene_whichever_are_named() -> None:
+    options = argparse.Namespace(quick=True, part="all", maps=["redkitchen"])
+    assert mapped(options) == QUICK

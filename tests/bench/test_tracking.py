@@ -122,7 +122,7 @@ def test_colmap_s_time_is_without_its_start_and_without_reading(
     model.num_reg_images.return_value = 0
     program.incremental_mapping.return_value = {0: model}
     monkeypatch.setitem(sys.modules, "pycolmap", program)
-    monkeypatch.setattr(colmap_poses, "reading_seconds", lambda images: 100.0)
+    monkeypatch.setattr(colmap_poses, "reading_seconds", lambda images: 50.0)  # twice
     colmap_poses.run(tmp_path, 1, photographs=False)
     found = load(tmp_path)
     assert found.processor_seconds > 0.0
