@@ -39,7 +39,7 @@ def test_the_cells_of_the_notebook(
         exec(compile(shown, "notebook.ipynb", "exec"), names)
     said = capsys.readouterr().out
     assert float(re.search(r"never mapped: ([\d.]+) dB", said)[1]) > 24  # type: ignore[index]
-    assert "frame 21: tracking, new keyframes" in said
+    assert re.search(r"frame \d+: tracking, new keyframes \[0, ", said)
     assert "\ntracking at [" in said
     assert (tmp_path / "runs/notebook/room.splat").stat().st_size > 0
 
@@ -59,7 +59,7 @@ def test_the_loop_over_a_camera(tmp_path: Path, capsys: pytest.CaptureFixture[st
     words = ["--video", str(video), *camera, "--save", str(tmp_path / "map"), *SMALL]
     camera_loop.main(["--every-frame", *words])
     said = capsys.readouterr().out
-    assert re.search(r"tracking\n.*keyframe 1\n", said)
+    assert re.search(r"tracking\n.*keyframe 0\n", said)
     assert f"saved in {tmp_path / 'map'}" in said
     assert len(GaussianMap.load(tmp_path / "map")) > 500
     newest = camera_loop.NewestFrame(cv2.VideoCapture(str(video)), rate=2000.0)

@@ -45,7 +45,7 @@ def test_it_returns_in_the_map_that_was_asked_for(
     monkeypatch.setattr("nodes.tracker.checkpoint_info", lambda _: None)  # the mapper's half
     killed, follower = Tracker(), Tracker()
     killed.kept_in = follower.kept_in = tmp_path / "run"
-    sent = [message for frame in frames[:30] for message in killed.on_frame(frame)]
+    sent = [message for frame in frames[:34] for message in killed.on_frame(frame)]
     last = max(message.index for message in sent if isinstance(message, Keyframe))
     request = Request(4, asked, folder=str(saved) if asked == "load_map" else "", kept=str(tmp_path / "kept"))
 
@@ -59,15 +59,15 @@ def test_it_returns_in_the_map_that_was_asked_for(
             patch.setattr(Returning, cut_off, die)
             with pytest.raises(Killed):
                 list(killed.on_request(request))
-    again = [message for frame in frames[last - 1 : 30] for message in follower.on_frame(frame)]
+    again = [message for frame in frames[last - 1 : 34] for message in follower.on_frame(frame)]
     if cut_off != "begin":  # until then it is in the map before, and so it comes back
         assert again == [], "frames from before the request are none of the new map's"
     assert list(follower.on_request(request)) == [request]
     assert tracker_file(tmp_path / "kept").is_file()
-    for frame in frames[30:33]:
+    for frame in frames[34:37]:
         list(follower.on_frame(frame))
     found = min(follower.core.session.graph.keyframes, default=0)
-    assert found < 0 if asked == "load_map" else found >= 30
+    assert found < 0 if asked == "load_map" else found >= 34
 
 
 def test_where_the_new_map_could_not_be_saved_none_is_gone_on_with(
@@ -77,7 +77,7 @@ def test_where_the_new_map_could_not_be_saved_none_is_gone_on_with(
     monkeypatch.setattr("nodes.tracker.checkpoint_info", lambda _: None)  # the mapper's half
     killed, follower = Tracker(), Tracker()
     killed.kept_in = follower.kept_in = tmp_path / "run"
-    for frame in frames[:30]:
+    for frame in frames[:34]:
         list(killed.on_frame(frame))
     keep = Core.keep_map
 
@@ -89,4 +89,4 @@ def test_where_the_new_map_could_not_be_saved_none_is_gone_on_with(
     monkeypatch.setattr(Core, "keep_map", full)
     list(killed.on_request(Request(4, "load_map", folder=str(saved), kept=str(tmp_path / "kept"))))
     with pytest.raises(ValueError, match="cannot go on"):
-        list(follower.on_frame(frames[30]))
+        list(follower.on_frame(frames[34]))

@@ -67,7 +67,8 @@ def partition(width: int) -> Callable[[], object]:
     all_of_it = np.ones((16, width), bool)
     given = {
         "colors": some(16, width, 3), "weight": some(16, width), "left": some(16, width), "taken": all_of_it,
-        "sure": all_of_it, "logarithm": np.ones((16, width)), "angle": 0.01, "price": 0.1, "threads": THREADS,
+        "sure": all_of_it, "logarithm": np.ones((16, width)), "angle": 0.01, "depth_noise": 0.02, "price": 0.1,
+        "threads": THREADS,
     }  # fmt: skip
     return lambda: native.load("mapping").partition(**given)
 
