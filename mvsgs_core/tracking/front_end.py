@@ -13,6 +13,7 @@ from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import CELL, TrackingImage
 from mvsgs_core.tracking.matching.flow import DenseInverseSearch, Matches, propagate, sample_field
 from mvsgs_core.tracking.matching.matcher import Matcher
+from mvsgs_core.tracking.places.geometric_verification import PlaceMatch
 from mvsgs_core.tracking.places.localization import Localization, localize
 
 FASTEST = 65504.0  # pixels a second: faster, of a timestamp that is wrong, is no number of an edge
@@ -82,6 +83,12 @@ class FrontEnd:
         )
         self.propagated = np.where(alive[:, None], matches.target, near)
         self.last, self.pose = image, pose
+
+    def found(self, place: PlaceMatch) -> Step:
+        """Of a frame in which a keyframe was found."""
+        textured = self.graph.keyframes[place.index].image.cells.textured.sum()
+        fraction = float(place.matches.alive.sum() / max(1, textured))
+        return Step(place.index, place.matches, fraction, np.inf, False, place.localization)
 
     def move_to(self, reference: TrackingImage, pose: np.ndarray) -> Step | None:
         """The last frame is followed from another keyframe from here on, whose pose (4, 4) is near its own.

@@ -119,8 +119,8 @@ class Session:
         if self.phase is Phase.INITIALIZING:
             yield from self._force_initialization()
         elif last := self._tail.last(self.choice):
-            self.waiting.end()
-            yield whole(self._add_keyframe(*last, record_of(self.records, last[0].index)))
+            record = record_of(self.records, last[0].index)
+            yield self._begin_work(last[0], record, self._add_keyframe(*last, record)).begun()
             if self.phase is Phase.INITIALIZING:  # the map contradicted it: a part of its own would begin
                 self.initializer.abandon()
         if largest := self.local_map.largest():
@@ -341,10 +341,13 @@ class Session:
         return Update(record.state)
 
     def _relocalize(self, frame: TrackingImage, record: FrameRecord) -> Update:
-        """The map is searched for the camera; when patience is over, a new segment begins."""
+        """The map is searched; a frame that shows little of it is a keyframe, to go on from. In the end a segment begins."""
         self.phase = Phase.RELOCALIZING
         if (place := self._search_map(frame)) is not None:
-            return self._resume(frame, record, place)
+            resumed, step = self._resume(frame, record, place), self.front_end.found(place)
+            if self._at_work or is_held_out(frame.index) or not self.front_end.is_lost(step):
+                return resumed
+            return self._begin_work(frame, record, self._add_keyframe(frame, step, record))
         if not self.relocalizer.hopeless:
             return Update(record.state)
         self.segment = 1 + max(self.publisher.highest_segment, *(k.segment for k in self.graph.keyframes.values()))
@@ -395,6 +398,3 @@ class Session:
         """Keyframes that were held back, with the focal length as far as it is known, and the frames between them."""
         self.calibration.settle(list(self.publisher.held))
         return self._published(self.records[-1], []).whole()
-
-
-__all__ = ["Session"]

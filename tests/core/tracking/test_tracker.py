@@ -10,8 +10,10 @@ import pytest
 
 from mvsgs_core import geometry
 from mvsgs_core.datasets import open_dataset
+from mvsgs_core.tracking.front_end import FrontEnd, Step
 from mvsgs_core.tracking.matching.flow import FLOWS
 from mvsgs_core.tracking.phase import Phase
+from mvsgs_core.tracking.places.geometric_verification import PlaceMatch
 from mvsgs_core.tracking.tracker import TrackerConfig
 from mvsgs_core.trajectory import TrackingState
 from tests.support.sequences import ate, synthetic, track, tracked_room
@@ -149,6 +151,27 @@ def test_a_jump_to_a_known_place_is_relocalized() -> None:
     shift = trajectory.world_from_cam[60:, :3, 3] - trajectory.world_from_cam[2:8, :3, 3]
     step = np.linalg.norm(np.diff(trajectory.world_from_cam[2:8, :3, 3], axis=0), axis=1).mean()
     assert np.linalg.norm(shift, axis=1).max() < 0.5 * step, "where it was before"
+
+
+def test_a_camera_that_is_found_with_few_of_the_map_s_points_goes_on_from_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # Covered for 30 frames, it comes back where some 15 % of the points of the last keyframes are seen: in none of 16
+    # frames more, and the map ended there.
+    items = synthetic(frames=120, covered=30)
+    tracker, trajectory, _ = track(items)
+    assert tracker.stats.counts["relocalized"] <= 2
+    assert set(trajectory.segment.tolist()) == {-1, 0}
+    assert min(trajectory.index[trajectory.keyframe & (trajectory.index >= 90)]) <= 92
+    error, length = ate(trajectory, items)
+    assert error < 0.01 * length
+    found = FrontEnd.found
+
+    def with_many(self: FrontEnd, place: PlaceMatch) -> Step:
+        return replace(found(self, place), fraction=1.0)
+
+    monkeypatch.setattr(FrontEnd, "found", with_many)
+    assert track(items)[0].stats.counts["relocalized"] > 2, "else this scene tests nothing"
 
 
 def test_a_jump_to_an_unseen_place_starts_a_segment_of_its_own() -> None:
