@@ -341,7 +341,7 @@ class Session:
         return Update(record.state)
 
     def _relocalize(self, frame: TrackingImage, record: FrameRecord) -> Update:
-        """The map is searched; a frame that shows little of it is a keyframe, to go on from. At last a segment begins."""
+        """The map is searched; a frame that shows little of it becomes a keyframe. At last a segment begins."""
         self.phase = Phase.RELOCALIZING
         if (place := self._search_map(frame)) is not None:
             resumed, step = self._resume(frame, record, place), self.front_end.found(place)
