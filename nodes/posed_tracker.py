@@ -9,14 +9,14 @@ import numpy as np
 
 from msgs import Frame, GroundTruth, Keyframe, Poses, Request, TrackedFrame, TrackingState, Trajectory
 from mvsgs_core.tracking.between import Between
-from mvsgs_core.tracking.coarse_depth import coarse_map
 from mvsgs_core.tracking.config import PosedConfig
-from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity, rectified, rectified_mask
+from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity
 from mvsgs_core.tracking.posed import PosedTracker as CoreTracker
 from mvsgs_core.tracking.publish import affine_of, changed_vignetting, differ
 from mvsgs_core.trajectory import velocities
 from nodes import Node
-from nodes.tracking import keep_place, places_of, refused, tracked_frame, warn_of_guessed_focal
+from nodes.tracked_messages import keyframe_message, tracked_frame_message
+from nodes.tracking import keep_place, places_of, refused, warn_of_guessed_focal
 
 
 class PosedTracker(Node):
@@ -121,7 +121,7 @@ class PosedTracker(Node):
         frame = self._frames[found.index]
         readout_time, reads_columns = self.config.readout_time, self.config.reads_columns
         velocity = self._velocity(frame.index) if readout_time else None
-        return tracked_frame(frame, found, frame.intrinsics, 1.0, velocity, readout_time, reads_columns)
+        return tracked_frame_message(frame, found, frame.intrinsics, 1.0, velocity, readout_time, reads_columns)
 
     def _velocity(self, index: int) -> np.ndarray | None:
         """(6,) between the poses before and after a frame; None where no neighbor tells it."""
@@ -134,32 +134,14 @@ class PosedTracker(Node):
         return velocity if velocity.any() else None
 
     def _keyframe(self, core: CoreTracker, index: int) -> Keyframe:
-        frame, keyframe = self._frames[index], core.keyframe(index)
-        light = core.photometer
+        frame, keyframe, light = self._frames[index], core.keyframe(index), core.photometer
         self._keyframes[index] = light.exposure(index)
-        inverse_depth, weight = coarse_map(keyframe)
         readout_time, reads_columns = self.config.readout_time, self.config.reads_columns
         velocity = camera_velocity(keyframe, core.graph.intrinsics) if readout_time else None
-        return Keyframe(
-            index=index,
-            timestamp=frame.timestamp,
-            image=rectified(frame.image, keyframe.image, readout_time, reads_columns),
-            intrinsics=frame.intrinsics,
-            world_from_cam=self._joined[index][1],
-            scale=1.0,
-            inverse_depth=inverse_depth,
-            inverse_depth_weight=weight,
-            segment=0,
-            exposure=self._keyframes[index],
-            vignetting=light.vignetting,
-            photograph=None if velocity is None else frame.image,
-            velocity=velocity,
-            readout_time=0.0 if velocity is None else readout_time,
-            reads_columns=reads_columns,
-            captured=frame.captured,
-            stamp=frame.stamp,
-            mask=rectified_mask(frame.mask, keyframe.image, readout_time, reads_columns),
-        )
+        return keyframe_message(
+            frame, keyframe, frame.intrinsics, self._joined[index][1], self._keyframes[index], light.vignetting,
+            velocity, readout_time, reads_columns,
+        )  # fmt: skip
 
     def _exposed(self, core: CoreTracker) -> Iterator[Poses]:
         """What the light of the keyframes sent is now, where it changed."""

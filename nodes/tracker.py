@@ -14,14 +14,14 @@ from mvsgs_core.kept_map import NOTHING_MAPPED, STREAM, check_kept_map, check_no
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from mvsgs_core.tracking import known_map
 from mvsgs_core.tracking.between import Between
-from mvsgs_core.tracking.coarse_depth import coarse_map
 from mvsgs_core.tracking.config import TrackerConfig
-from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity, rectified, rectified_mask
+from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity
 from mvsgs_core.tracking.publish import Correction, Update
 from mvsgs_core.tracking.tracker import Tracker as CoreTracker
 from nodes.localization_file import LocalizationFile
 from nodes.returning import Returning
-from nodes.tracking import TrackerNode, tracked_frame
+from nodes.tracked_messages import keyframe_message, tracked_frame_message
+from nodes.tracking import TrackerNode
 
 ONLY_LOCALIZES = "this run only localizes: begin one with map=DIR and without mapper=frozen, and switch by localize"
 
@@ -236,37 +236,19 @@ class Tracker(TrackerNode):
 
     def _keyframe(self, index: int) -> Keyframe:
         frame, keyframe = self._frames[index], self.core.keyframe(index)
-        inverse_depth, weight = coarse_map(keyframe)
         velocity = self._velocity(index) if self._readout_time else None
         if not self._readout_time:
             self._without_shutter.add(index)
-        with self.stats.time("rectification"):
-            image = rectified(frame.image, keyframe.image, self._readout_time, self._reads_columns)
         self._readout_times.append(0.0 if keyframe.image.velocity is None else self._readout_time)
         if any(self._readout_times):
             self.stats.values["rolling shutter taken out of keyframes"] = in_milliseconds(self._readout_times)
         if self._readout_time and keyframe.image.velocity is None:
             self.stats.count("keyframes with the rolling shutter still in: no velocity")
-        return Keyframe(
-            index=index,
-            timestamp=frame.timestamp,
-            image=image,
-            intrinsics=self._intrinsics(frame),
-            world_from_cam=geometry.inverse(keyframe.cam_from_world),
-            scale=1.0,
-            inverse_depth=inverse_depth,
-            inverse_depth_weight=weight,
-            segment=keyframe.segment,
-            exposure=self.core.exposure(index),
-            vignetting=self.core.vignetting,
-            photograph=None if velocity is None else frame.image,
-            velocity=velocity,
-            readout_time=0.0 if velocity is None else self._readout_time,
-            reads_columns=self._reads_columns,
-            captured=frame.captured,
-            stamp=frame.stamp,
-            mask=rectified_mask(frame.mask, keyframe.image, self._readout_time, self._reads_columns),
-        )
+        with self.stats.time("rectification"):
+            return keyframe_message(
+                frame, keyframe, self._intrinsics(frame), geometry.inverse(keyframe.cam_from_world),
+                self.core.exposure(index), self.core.vignetting, velocity, self._readout_time, self._reads_columns,
+            )  # fmt: skip
 
     def _camera_pose(self, frame: Frame) -> CameraPose | None:
         found = self.core.newest_pose()
@@ -275,7 +257,7 @@ class Tracker(TrackerNode):
     def _between(self, found: Between) -> TrackedFrame:
         frame, velocity = self._frames[found.index], found.velocity if self.config.rectify_rolling_shutter else None
         intrinsics, scale = self._intrinsics(frame), self.core.scale(found.keyframe)
-        return tracked_frame(frame, found, intrinsics, scale, velocity, self._readout_time, self._reads_columns)
+        return tracked_frame_message(frame, found, intrinsics, scale, velocity, self._readout_time, self._reads_columns)
 
     def _intrinsics(self, frame: Frame) -> np.ndarray:
         return frame.intrinsics * [self.core.focal_factor, self.core.focal_factor, 1.0, 1.0]

@@ -62,36 +62,6 @@ def places_of(index: np.ndarray, places: dict[int, np.ndarray]) -> np.ndarray | 
     return np.stack([places.get(int(i), unknown) for i in index]) if places and len(index) else None
 
 
-def tracked_frame(
-    frame: Frame,
-    found: Between,
-    intrinsics: np.ndarray,
-    scale: float,
-    velocity: np.ndarray | None,
-    readout_time: float,
-    reads_columns: bool,
-) -> TrackedFrame:
-    """A frame between keyframes, with its pose from one of them, in a map of that scale.
-
-    intrinsics (4,) as found; velocity (6,) of the camera, without which no readout time is sent: None where no neighbor
-    tells it, or nobody asks.
-    """
-    return TrackedFrame(
-        index=frame.index,
-        timestamp=frame.timestamp,
-        image=frame.image,
-        intrinsics=intrinsics,
-        keyframe=found.keyframe,
-        keyframe_from_cam=found.keyframe_from_cam,
-        scale=scale,
-        exposure=found.exposure,
-        velocity=velocity,
-        readout_time=0.0 if velocity is None else readout_time,
-        reads_columns=reads_columns,
-        mask=frame.mask,
-    )
-
-
 def refused(request: Request, tracker: type[Node]) -> Request:
     """Passed on by a tracker that can only be paused."""
     if request.problem or request.asked == Asked.PAUSE:

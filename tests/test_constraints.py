@@ -15,11 +15,28 @@ from tests.support.shared_data import ROOT
 TRITON_OF = {"2.13.0": "3.7.1"}
 
 
-def pinned(name: str) -> str:
+WITHOUT_ARM = {"cyclonedds", "pycolmap"}  # PyPI has no wheel of them for Linux on ARM
+
+
+def requirements() -> list[Requirement]:
     lines = (ROOT / "constraints.txt").read_text().splitlines()
-    requirements = [Requirement(line) for line in lines if not line.startswith("#")]
-    (found,) = [requirement for requirement in requirements if requirement.name == name]
+    return [Requirement(line) for line in lines if not line.startswith("#")]
+
+
+def pinned(name: str) -> str:
+    (found,) = [requirement for requirement in requirements() if requirement.name == name]
     return str(found.specifier).removeprefix("==")
+
+
+def test_on_arm_nothing_is_asked_for_that_has_no_wheel() -> None:
+    linux = {"platform_system": "Linux", "sys_platform": "linux"}
+    left_out = {
+        machine: {
+            r.name for r in requirements() if r.marker and not r.marker.evaluate(linux | {"platform_machine": machine})
+        }
+        for machine in ("x86_64", "aarch64")
+    }
+    assert left_out == {"x86_64": set(), "aarch64": WITHOUT_ARM}
 
 
 def test_all_that_is_asked_for_is_pinned_but_what_the_header_names() -> None:
