@@ -22,7 +22,10 @@ _FLAGS = {
 
 @functools.cache
 def instruction_sets() -> tuple[str, ...]:
-    """The instruction sets that this CPU can run, the best first."""
+    """The instruction sets that kernels may use, the best first: all that this CPU can run, or the one that is forced.
+
+    Raises ImportError if this CPU cannot run that one.
+    """
     flags: set[str] = set()
     cpuinfo = Path("/proc/cpuinfo")
     if platform.machine() in ("x86_64", "AMD64") and cpuinfo.exists():
@@ -30,7 +33,11 @@ def instruction_sets() -> tuple[str, ...]:
             if line.startswith("flags"):
                 flags = set(line.split(":", 1)[1].split())
                 break
-    return tuple(name for name, needed in _FLAGS.items() if needed <= flags)
+    known = tuple(name for name, needed in _FLAGS.items() if needed <= flags)
+    forced = os.environ.get("MVSGS_ARCH")
+    if forced and forced not in known:
+        raise ImportError(f"MVSGS_ARCH={forced}: this CPU has {', '.join(known)}")
+    return (forced,) if forced else known
 
 
 @functools.cache
@@ -39,10 +46,7 @@ def load(name: str) -> ModuleType:
 
     Raises ImportError, saying what to run, if the kernels were not built.
     """
-    forced = os.environ.get("MVSGS_ARCH")
-    if forced and forced not in instruction_sets():
-        raise ImportError(f"MVSGS_ARCH={forced}: this CPU has {', '.join(instruction_sets())}")
-    for arch in (forced,) if forced else instruction_sets():
+    for arch in instruction_sets():
         try:
             return importlib.import_module(f"mvsgs_core._{name}_{arch}")
         except ModuleNotFoundError:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from mvsgs import doctor
+from mvsgs import WORKSPACE, doctor
 from mvsgs_core import native, weights
 
 
@@ -30,6 +32,19 @@ def test_kernels_that_are_not_built_are_said(
     said = capsys.readouterr().out
     assert "! kernels                      `_rasterizer` are not built" in said
     assert said.endswith("to be looked at: kernels\n")
+
+
+@pytest.mark.parametrize(
+    ("forced", "code", "found"), [("generic", 0, "scene: generic\n"), ("v9", 1, "MVSGS_ARCH=v9: ")]
+)
+def test_kernels_that_are_forced_are_said(forced: str, code: int, found: str) -> None:
+    script = "import sys; from mvsgs.doctor import main; sys.exit(main(['--no-test']))"
+    env = {**os.environ, "MVSGS_ARCH": forced}
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=env, cwd=WORKSPACE)
+    assert done.returncode == code, done.stderr
+    (processor,) = [line for line in done.stdout.splitlines() if "processor  " in line]
+    assert "generic kernels" in processor if code == 0 else found in processor
+    assert found in done.stdout
 
 
 @pytest.mark.slow

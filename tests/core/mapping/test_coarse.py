@@ -45,7 +45,7 @@ def test_what_was_mapped_coarsely_is_as_good_in_the_end_as_what_was_not() -> Non
     there = pose_on_arc(0.3)
     between, doubled = rgbd_keyframe(99, there), rgbd_keyframe(99, there, unit=2.0)
     assert score(hurried, doubled) > score(left, between) + 0.5
-    assert score(hurried, doubled) > score(whole, between) - 1.0
+    assert score(hurried, doubled) > score(whole, between) - 1.5
 
 
 def test_a_limit_holds_for_iterations_and_not_for_splats() -> None:
