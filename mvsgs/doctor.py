@@ -22,6 +22,7 @@ from mvsgs import WORKSPACE
 from mvsgs_core import machine, native, weights
 from mvsgs_core.devices import lacks_for_gpu, torch_refuses
 from mvsgs_core.named_modules import is_installed
+from mvsgs_core.open3d_loader import open3d
 
 KERNELS = ("rasterizer", "mapping", "tracking", "mvs", "fusion", "scene")
 NEEDED = ("torch", "numpy", "pyzmq", "opencv-contrib-python-headless", "open3d", "viser", "av")
@@ -47,8 +48,7 @@ def checks() -> Iterator[tuple[str, str, bool]]:
     yield from _kernels()
     yield "gpu", *_gpu()
     for name in NEEDED:
-        version = _version(name)
-        yield name, version or "missing: make setup", version is not None
+        yield name, *_needed(name)
     for module, purpose in OPTIONAL.items():
         there = is_installed(module)
         yield module, _version(module) or "there" if there else f"not there; only for {purpose}", True
@@ -81,6 +81,18 @@ def self_test(folder: Path) -> tuple[str, bool]:
     reached = f"{tracked} of 30 frames tracked, held-out PSNR {psnr or 0.0:.1f} dB, {seconds:.0f} s"
     right = tracked == 30 and psnr is not None and psnr >= LEAST_PSNR
     return reached if right else f"{reached}: at least {LEAST_PSNR:.0f} dB of all frames were expected", right
+
+
+def _needed(name: str) -> tuple[str, bool]:
+    version = _version(name)
+    if version is None:
+        return "missing: make setup", False
+    try:
+        if name == "open3d":  # it needs libraries of the system's, which pip does not bring
+            open3d()
+    except ImportError as error:
+        return f"{version}, for meshes: {error}", False
+    return version, True
 
 
 def _processor() -> tuple[str, bool]:

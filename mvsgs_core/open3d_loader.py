@@ -1,4 +1,4 @@
-"""open3d, imported late: it takes a second and 200 MB, and links libusb even where no camera is used."""
+"""open3d, imported late: it takes a second and 200 MB, and links libusb and OpenGL even without camera and screen."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from types import ModuleType
 
 @functools.cache
 def open3d() -> ModuleType:
-    """The open3d module. Raises ImportError with the command that mends a missing libusb."""
+    """The open3d module. Raises ImportError with the command that mends a missing library of the system's."""
     try:  # the pip package carries the library; the loader then finds it by its name
         import libusb_package
 
@@ -18,6 +18,7 @@ def open3d() -> ModuleType:
         pass  # a system-wide libusb serves as well; what is missing is said below
     try:
         import open3d as o3d
-    except OSError as error:
-        raise ImportError(f"open3d does not load ({error}): apt install libusb-1.0-0 libgl1 libgomp1") from error
+    except (ImportError, OSError) as error:
+        mended = "sudo apt install libegl1 libgl1 libgomp1 libusb-1.0-0"
+        raise ImportError(f"open3d does not load ({error}): {mended}") from error
     return o3d

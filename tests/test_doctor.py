@@ -47,6 +47,19 @@ def test_kernels_that_are_forced_are_said(forced: str, code: int, found: str) ->
     assert found in done.stdout
 
 
+def test_an_open3d_that_does_not_load_is_said(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refused() -> None:
+        raise ImportError("open3d does not load (libEGL.so.1): sudo apt install libegl1")
+
+    monkeypatch.setattr(doctor, "open3d", refused)
+    assert doctor.main(["--no-test"]) == 1
+    said = capsys.readouterr().out
+    assert "for meshes: open3d does not load (libEGL.so.1): sudo apt install libegl1" in said
+    assert said.endswith("to be looked at: open3d\n")
+
+
 @pytest.mark.slow
 def test_the_self_test_maps_the_room(tmp_path: Path) -> None:
     reached, right = doctor.self_test(tmp_path)

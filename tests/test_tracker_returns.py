@@ -62,7 +62,7 @@ def test_what_was_sent_after_the_last_save_is_counted_and_no_map_is_no_return(tm
         log.write(f"\nKeyframe {last + 5};\nPoses 70;\nKeyframe {last + 50}")  # and the last line cut off
     follower = Tracker()
     follower.kept_in = tmp_path / "kept"
-    after = sent(follower, given[last + 4 :])
+    after = [*sent(follower, given[last + 4 :]), *follower.on_end()]
     assert follower.stats.skipped["frames that came again"] == 2
     assert follower.stats.skipped["keyframes that a killed tracker sent after it had saved its map"] >= 1
     assert min(message.revision for message in after if isinstance(message, Poses)) > 70

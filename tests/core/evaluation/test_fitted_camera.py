@@ -90,7 +90,7 @@ def test_only_pose_and_exposure_change_and_the_map_does_not(splats: Splats) -> N
     before = {name: value.clone() for name, value in splats.tensors().items()}
     start = disturbed(true_frame(splats))
     found = fit_camera(splats, "gaussian", start)
-    assert replace(found, world_from_cam=start.world_from_cam, exposure=None) == start
+    np.testing.assert_equal(vars(replace(found, world_from_cam=start.world_from_cam, exposure=None)), vars(start))
     assert all(torch.equal(value, before[name]) for name, value in splats.tensors().items())
     assert not any(value.requires_grad for value in splats.tensors().values())
 
