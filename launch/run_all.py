@@ -39,6 +39,7 @@ try:
     from launch.graph_text import graph_text
     from launch.help_text import help_text
     from launch.jobs import Job, RunFailed, refused, run
+    from launch.late_help import accept_late_help
     from launch.named_input import SLOT, with_named_input
     from launch.outcome import FAILED
     from launch.refusal import GraphError
@@ -67,6 +68,7 @@ def main(arguments: Sequence[str]) -> int:
     except GraphError as error:
         return refused(error)
     os.environ |= python_environment()  # Hydra's launchers start workers that need the workspace too
+    accept_late_help()
     codes: list[int] = []
     failed: list[str] = []
     here = os.getpid()

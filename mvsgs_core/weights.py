@@ -186,6 +186,8 @@ def fetch(name: str, timeout: float = 30.0) -> Path:
     try:
         _download(weights.url, part, weights.size, timeout)
     except (urllib.error.URLError, TimeoutError, OSError) as error:
+        if isinstance(error, urllib.error.HTTPError):
+            error.close()  # it is the server's answer, too, which holds the connection
         raise ConnectionError(
             f"{weights.url}: {error}; what has arrived is kept, try again, or: {weights.page}"
         ) from error

@@ -15,9 +15,9 @@ from tests.support.shared_data import ROOT
 TRITON_OF = {"2.13.0": "3.7.1"}
 
 
-NO_WHEEL = {  # that PyPI has none of for Linux, by machine and version of Python
+NO_WHEEL = {  # that PyPI has none of for Linux, by machine and version of Python (3.14 has zstd itself)
     ("x86_64", "3.11"): set[str](),
-    ("x86_64", "3.14"): {"cyclonedds"},
+    ("x86_64", "3.14"): {"backports-zstd", "cyclonedds"},
     ("aarch64", "3.11"): {"cyclonedds", "pycolmap"},
 }
 
