@@ -3,21 +3,22 @@
     python -m bench.networks [--quick] [--json FILE]
 
 Random weights where none are needed to build a network: cost does not depend on them. Each network runs in a process
-of its own, on one thread, so that its peak memory is its own. Multiply-adds are those of convolutions and matrix
-products; sampling and activations are not counted, and a figure of zero is left out. Seconds are of the processor,
-of the second run.
+of its own, on one thread, so that its peak memory is its own; it is of the second run, as PyTorch loads in the first
+what it computes with. Multiply-adds are those of convolutions and matrix products; sampling and activations are not
+counted, and a figure of zero is left out. Seconds are of the processor, of the third run.
 """
 
 from __future__ import annotations
 
 import argparse
+import ctypes
 import json
 import os
-import resource
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
@@ -33,6 +34,7 @@ from mvsgs_core.networks.itermvs import IterMvs
 from mvsgs_core.networks.mvsformer import MvsFormer
 from mvsgs_core.networks.raft_small import RaftSmall
 from mvsgs_core.networks.vfuse import FusionInput, VFuse
+from nodes.runtime.status import peak_bytes, rss
 
 Case = tuple[nn.Module, Callable[[], object]]
 _VIEWS = 5  # a reference and its four neighbors, as the paper
@@ -108,9 +110,13 @@ CASES: dict[str, Callable[[int, int, str], Case]] = {
 }
 
 
-def _peak() -> float:
-    """MB of this process so far."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6  # which is in KiB
+def _peak(work: Callable[[], object]) -> float:
+    """MB of memory that it takes for a while, beyond what is taken now."""
+    ctypes.CDLL(None).malloc_trim(0)
+    before = rss()
+    Path("/proc/self/clear_refs").write_text("5")  # the peak is from here on
+    work()
+    return (peak_bytes() - before) / 1e6
 
 
 @torch.no_grad()
@@ -122,9 +128,8 @@ def measure_one(name: str, h: int, w: int) -> dict[str, float | str]:
         net, work = CASES[name](h, w, "cpu")
     except FileNotFoundError as error:
         return {"missing": str(error)}
-    before = _peak()
     work()
-    memory = _peak() - before
+    memory = _peak(work)
     start = time.process_time()
     work()
     seconds = time.process_time() - start
