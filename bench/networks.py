@@ -3,9 +3,9 @@
     python -m bench.networks [--quick] [--json FILE]
 
 Random weights where none are needed to build a network: cost does not depend on them. Each network runs in a process
-of its own, on one thread, so that its peak memory is its own; it is of the second run, as PyTorch loads in the first
-what it computes with. Multiply-adds are those of convolutions and matrix products; sampling and activations are not
-counted, and a figure of zero is left out. Seconds are of the processor, of the third run.
+of its own, on one thread, so that its peak memory is its own. Multiply-adds are those of convolutions and matrix
+products; sampling and activations are not counted, and a figure of zero is left out. Seconds are of the processor, of
+the second run; memory is of the third: in the first PyTorch loads what it computes with.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from mvsgs_core.networks.vfuse import FusionInput, VFuse
 from nodes.runtime.status import peak_bytes, rss
 
 Case = tuple[nn.Module, Callable[[], object]]
+_MMAP_THRESHOLD = -3  # of mallopt, malloc.h
 _VIEWS = 5  # a reference and its four neighbors, as the paper
 
 
@@ -112,7 +113,9 @@ CASES: dict[str, Callable[[int, int, str], Case]] = {
 
 def _peak(work: Callable[[], object]) -> float:
     """MB of memory that it takes for a while, beyond what is taken now."""
-    ctypes.CDLL(None).malloc_trim(0)
+    system = ctypes.CDLL(None)
+    system.mallopt(_MMAP_THRESHOLD, 1 << 18)  # what is freed goes back at once, which takes time
+    system.malloc_trim(0)
     before = rss()
     Path("/proc/self/clear_refs").write_text("5")  # the peak is from here on
     work()
@@ -129,10 +132,10 @@ def measure_one(name: str, h: int, w: int) -> dict[str, float | str]:
     except FileNotFoundError as error:
         return {"missing": str(error)}
     work()
-    memory = _peak(work)
     start = time.process_time()
     work()
     seconds = time.process_time() - start
+    memory = _peak(work)
     counter = FlopCounterMode(display=False)
     with counter:
         work()
