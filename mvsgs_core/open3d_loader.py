@@ -18,6 +18,8 @@ def open3d() -> ModuleType:
         pass  # a system-wide libusb serves as well; what is missing is said below
     try:
         import open3d as o3d
+    except ModuleNotFoundError:
+        raise  # open3d itself, which no library of the system's brings
     except (ImportError, OSError) as error:
         mended = "sudo apt install libegl1 libgl1 libgomp1 libusb-1.0-0"
         raise ImportError(f"open3d does not load ({error}): {mended}") from error

@@ -22,3 +22,10 @@ def test_a_missing_library_is_named_with_what_brings_it(monkeypatch: pytest.Monk
     monkeypatch.setattr(sys, "meta_path", [WithoutEgl(), *sys.meta_path])
     with pytest.raises(ImportError, match=r"libEGL.so.1.* sudo apt install libegl1 "):
         open3d.__wrapped__()
+
+
+def test_an_open3d_that_is_not_installed_is_no_matter_of_the_system_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(ModuleNotFoundError) as refused:
+        open3d.__wrapped__()
+    assert "apt install" not in str(refused.value)

@@ -42,10 +42,13 @@ def test_what_was_mapped_coarsely_is_as_good_in_the_end_as_what_was_not() -> Non
     assert hurried.log.counts[LATER] == len(VIEWS)
     assert hurried.iterations == left.iterations == whole.iterations == 60
     assert not len(hurried.coarse)
+    for mapper in (whole, hurried, left):
+        for done in range(mapper.refinement):
+            mapper.refine(done, mapper.refinement)
     there = pose_on_arc(0.3)
     between, doubled = rgbd_keyframe(99, there), rgbd_keyframe(99, there, unit=2.0)
     assert score(hurried, doubled) > score(left, between) + 0.5
-    assert score(hurried, doubled) > score(whole, between) - 1.5
+    assert score(hurried, doubled) > score(whole, between) - 1.0
 
 
 def test_a_limit_holds_for_iterations_and_not_for_splats() -> None:

@@ -48,7 +48,7 @@ def test_back_ends_agree_with_the_reference(backend: str, kernel: str) -> None:
     if backend == "triton":
         pytest.importorskip("triton", reason="triton is not installed: pip install triton to run its interpreter")
     count, size = (200, (40, 56)) if backend == "cpu" else (40, (20, 35))
-    splats = random_splats(count)
+    splats = random_splats(count, seed=1)  # with 0 a pixel's only splat lies within 1e-9 of 1/255: seen or not, on ARM
     assert_agree(splats, size, backend, kernel=kernel, antialiased=True, readout=READOUT)
     assert_agree(splats, size, backend, kernel=kernel, readout=20 * READOUT)  # beyond MAX_MOTION, most of them
     assert_agree(splats, size, backend, kernel=kernel, antialiased=True, readout=READOUT, reads_columns=True)
