@@ -11,6 +11,7 @@
 #include "bindings.hpp"
 #include "bundle_adjustment.hpp"
 #include "cholesky.hpp"
+#include "hamming.hpp"
 #include "lucas_kanade.hpp"
 #include "nearest.hpp"
 #include "optimize.hpp"
@@ -144,6 +145,21 @@ static Result<double> median_of_nearest(Array<double> points, Array<double> valu
     return to_numpy(std::move(out), {static_cast<size_t>(m)});
 }
 
+// (P, 2) rows of two lists of binary descriptors that match.
+static Result<int64_t> match_binary(Array<uint8_t> a, Array<uint8_t> b, int limit, double ratio) {
+    for (const auto& descriptors : {a, b})
+        require(descriptors.ndim() == 2 && descriptors.shape(1) == DESCRIPTOR_BYTES,
+                "match_binary: descriptors must be (N, 32)");
+    const int n = static_cast<int>(a.shape(0)), m = static_cast<int>(b.shape(0));
+    std::vector<int64_t> out;
+    {
+        nb::gil_scoped_release release;
+        out = mutual_matches(a.data(), n, b.data(), m, limit, ratio);
+    }
+    const size_t pairs = out.size() / 2;
+    return to_numpy(std::move(out), {pairs, 2});
+}
+
 // Solution (N) of A x = b and the smallest relative pivot: a serial solve, which a busy machine does not slow down.
 static nb::tuple solve_positive_definite(Array<double> a, Array<double> b) {
     std::vector<double> matrix(a.data(), a.data() + a.size()), x(b.data(), b.data() + b.size());
@@ -167,6 +183,7 @@ NB_MODULE(MVSGS_MODULE, m) {
           nb::arg("border"), nb::arg("start_level"), nb::arg("iterations"), nb::arg("window_sigma"),
           nb::arg("min_eigenvalue"), nb::arg("threads"));
     m.def("solve_positive_definite", &solve_positive_definite, nb::arg("a"), nb::arg("b"));
+    m.def("match_binary", &match_binary, nb::arg("a"), nb::arg("b"), nb::arg("limit"), nb::arg("ratio"));
     m.def("median_of_nearest", &median_of_nearest, nb::arg("points"), nb::arg("values"), nb::arg("queries"),
           nb::arg("count"), nb::arg("radius"));
 }

@@ -139,7 +139,7 @@ def log_ratio_moments(
         z[..., 5:8] += sign * term.T[..., None] * at
     z[..., 8] = ratio.T
     weight = (robust[:, None] / (variance * scale**2)).T
-    return np.asarray(np.einsum("cni,cn,cnj->cij", z, weight, z, optimize=True))
+    return np.asarray((weight[..., None] * z).transpose(0, 2, 1) @ z)
 
 
 def of_response(moments: np.ndarray, response: float) -> np.ndarray:

@@ -5,24 +5,21 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from mvsgs_core import native
 from mvsgs_core.tracking.image import TrackingImage
 
+FARTHEST = 64  # bits of 256 from which on two descriptors are no match
+RATIO = 0.85  # of the distance to the second best match, that of the best is less than this
 
-def match_descriptors(a: np.ndarray, b: np.ndarray, ratio: float = 0.85) -> np.ndarray:
-    """Pairs (N, 2) int of mutual best matches of two sets of binary descriptors that pass the ratio test."""
+
+def match_descriptors(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Pairs (P, 2) int64 of mutual best matches of two sets (N, 32) of binary descriptors that pass the ratio test.
+
+    None where a set has fewer than two: nothing tells then whether the best is better than another.
+    """
     if len(a) < 2 or len(b) < 2:
         return np.zeros((0, 2), np.int64)
-    matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
-    forward = [
-        (best.queryIdx, best.trainIdx)
-        for best, second in (pair for pair in matcher.knnMatch(a, b, k=2) if len(pair) == 2)
-        if best.distance < 64 and best.distance < ratio * second.distance
-    ]
-    if not forward:
-        return np.zeros((0, 2), np.int64)
-    asked = np.unique([there for _, there in forward])  # the way back only of those that a pair ends at
-    back = {int(asked[m.queryIdx]): m.trainIdx for m in matcher.match(b[asked], a)}
-    return np.array([pair for pair in forward if back[pair[1]] == pair[0]], np.int64).reshape(-1, 2)
+    return np.asarray(native.load("tracking").match_binary(a, b, FARTHEST, RATIO))
 
 
 def match_features(a: TrackingImage, b: TrackingImage, threshold: float = 1.0) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 TABLES = 4
-BITS = 14  # a word; descriptors of the same corner share the word of some table
+BITS = 14  # a word, of two bytes; descriptors of the same corner share the word of some table
 MOST_POSTINGS = 600_000  # that a query looks at: those of its rarest words, so that it costs no more in a large map
 
 
@@ -57,9 +57,9 @@ class Retrieval:
     def _words(self, descriptors: np.ndarray) -> np.ndarray:
         if len(descriptors) == 0:
             return np.zeros(0, np.int64)
-        bits = np.unpackbits(descriptors, axis=1).astype(np.int64)
-        powers = 1 << np.arange(BITS, dtype=np.int64)
-        return np.concatenate([bits[:, chosen] @ powers + (t << BITS) for t, chosen in enumerate(self._bits)])
+        bits = np.unpackbits(descriptors.T, axis=0)[self._bits]
+        low, high = np.packbits(bits, axis=1, bitorder="little").transpose(1, 0, 2).astype(np.int64)
+        return np.asarray(low + (high << 8) + (np.arange(TABLES)[:, None] << BITS)).ravel()
 
 
 __all__ = ["Retrieval"]
