@@ -105,9 +105,7 @@ class Evaluator(Node):
             self.stats.warn(note)
         self.report = without_passwords(self.report)
         if self.folder:
-            self._write(self.folder)
-            if found is not None:
-                write_georeference(self.folder / GEOREFERENCE, found)
+            self._write(self.folder, found)
         self.evaluation.close()
         yield from ()
 
@@ -168,8 +166,11 @@ class Evaluator(Node):
             f"{_masked(self.evaluation.masked)}{_aligned(self.report['trajectory'])}"
         )
 
-    def _write(self, folder: Path) -> None:
-        """Each file in one step; the room that the frames took on disk is given back before."""
+    def _write(self, folder: Path, placed: Georeference | None) -> None:
+        """Each file in one step; the room that the frames took on disk is given back before.
+
+        report.json comes last: it says that the run has finished, and then nobody goes on with it.
+        """
         comparisons = pictures.comparisons(self.evaluation)
         document = html.page(
             self.config.title,
@@ -179,7 +180,6 @@ class Evaluator(Node):
             pictures.plots(self.evaluation, self.report["time"]["stages"]),
         )
         self.evaluation.close()
-        replace_text(folder / "report.json", json.dumps(_plain(self.report), indent=1, allow_nan=False))
         found = self.evaluation.final_trajectory
         if found is not None and self.evaluation.trajectory is not None:  # else the mapper's stays, which has times
             with replacing(folder / "trajectory.txt") as aside:
@@ -188,7 +188,10 @@ class Evaluator(Node):
         if comparisons:
             with replacing(folder / "comparison.png") as aside:
                 pictures.write_sheet(aside, comparisons)
+        if placed is not None:
+            write_georeference(folder / GEOREFERENCE, placed)
         replace_text(folder / "report.html", document)
+        replace_text(folder / "report.json", json.dumps(_plain(self.report), indent=1, allow_nan=False))
 
 
 def _fitted(report: dict[str, Any]) -> str:

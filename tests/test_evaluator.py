@@ -78,6 +78,22 @@ def test_files(evaluator: Evaluator) -> None:
     assert len((evaluator.folder / "trajectory.txt").read_text().splitlines()) == N + 1
 
 
+@pytest.mark.parametrize("last", ["write_trajectory", "pictures.write_sheet", "html.page"])
+def test_a_report_that_is_there_says_that_the_other_files_are(
+    evaluator: Evaluator, monkeypatch: pytest.MonkeyPatch, last: str
+) -> None:
+    """A run whose report.json says finished is not gone on with: killed before, it makes what is missing."""
+
+    def killed(*given: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"nodes.evaluator.{last}", killed)
+    with pytest.raises(KeyboardInterrupt):
+        feed(evaluator)
+    assert evaluator.folder is not None
+    assert not (evaluator.folder / "report.json").exists()
+
+
 def test_with_gps_the_report_and_a_file_say_where_the_map_lies(evaluator: Evaluator) -> None:
     """The unit of the poses is 50 m here, x goes east, y down, z north."""
     x, y, z = 50.0 * poses_along()[:, :3, 3].T + 0.1 * np.random.default_rng(0).standard_normal((3, N))
@@ -233,7 +249,7 @@ def test_a_report_that_cannot_be_written_leaves_the_one_before(
     monkeypatch.setattr(Path, "write_text", full)
     with pytest.raises(OSError, match="No space left"):
         feed(evaluator)
-    assert [p.name for p in evaluator.folder.iterdir()] == ["report.json"]
+    assert {p.name for p in evaluator.folder.iterdir()} == {"report.json", "trajectory.txt", "comparison.png"}
     assert (evaluator.folder / "report.json").read_text() == before
 
 

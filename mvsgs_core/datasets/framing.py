@@ -13,6 +13,7 @@ from mvsgs_core.datasets.lens import Lens, Undistortion
 Size = tuple[int, int] | Sequence[int] | int | None
 # Pixels of a frame where no size was asked for: robots' cameras (1280x1024) stay as they are; 4K would take hours.
 LARGEST = 1_500_000
+SMALLEST = 12  # pixels of a side that is asked for: on smaller ones nothing is found, and flows fail
 _KEPT = 4  # undistortion maps in memory: most sequences have one camera, some a camera for each image
 
 
@@ -23,11 +24,16 @@ def target_size(size: Size, native: tuple[int, int]) -> tuple[int, int]:
     if size is None:
         return native if native[0] * native[1] <= LARGEST else fit_size(*native, area=LARGEST)
     if isinstance(size, int):
-        if size < 64:
-            raise ValueError(f"size as one number is a count of pixels, at least 64; got {size}")
-        return fit_size(*native, area=size)
-    if len(size) != 2 or any(side < 8 for side in size):
-        raise ValueError(f"size is [height, width] of at least 8 pixels each, a count of pixels or null; got {size}")
+        fitted = fit_size(*native, area=size) if size > 0 else (0, 0)
+        if min(fitted) < SMALLEST:
+            raise ValueError(
+                f"size={size} is a count of pixels: a side of {native[1]}x{native[0]} would be below {SMALLEST}"
+            )
+        return fitted
+    if len(size) != 2 or any(side < SMALLEST for side in size):
+        raise ValueError(
+            f"size is [height, width] of at least {SMALLEST} pixels each, a count of pixels or null; got {size}"
+        )
     return int(size[0]), int(size[1])
 
 
