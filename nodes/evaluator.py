@@ -180,6 +180,7 @@ class Evaluator(Node):
             pictures.plots(self.evaluation, self.report["time"]["stages"]),
         )
         self.evaluation.close()
+        replace_text(folder / "report.html", document)
         found = self.evaluation.final_trajectory
         if found is not None and self.evaluation.trajectory is not None:  # else the mapper's stays, which has times
             with replacing(folder / "trajectory.txt") as aside:
@@ -190,7 +191,6 @@ class Evaluator(Node):
                 pictures.write_sheet(aside, comparisons)
         if placed is not None:
             write_georeference(folder / GEOREFERENCE, placed)
-        replace_text(folder / "report.html", document)
         replace_text(folder / "report.json", json.dumps(_plain(self.report), indent=1, allow_nan=False))
 
 

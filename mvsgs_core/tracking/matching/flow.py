@@ -20,6 +20,8 @@ from mvsgs_core.named_modules import import_named
 from mvsgs_core.tracking.image import BORDER, TrackingImage
 from mvsgs_core.tracking.matching.features import match_features
 
+FEWEST_ROWS = 32  # of a half-size image wider than high: OpenCV halves by the width, and reads beyond fewer
+
 
 @dataclass(frozen=True)
 class Matches:
@@ -98,6 +100,10 @@ class DenseInverseSearch:
 
     def field(self, a: TrackingImage, b: TrackingImage) -> np.ndarray:
         """(H / 2, W / 2, 2) float32, in pixels of the full size."""
+        height, width = a.half.shape
+        if height < FEWEST_ROWS and height < width:
+            turned = self._method.calc(np.ascontiguousarray(a.half.T), np.ascontiguousarray(b.half.T), None)
+            return np.asarray(2.0 * turned.transpose(1, 0, 2)[..., ::-1])
         return np.asarray(2.0 * self._method.calc(a.half, b.half, None))
 
     def match(self, a: TrackingImage, b: TrackingImage, points: np.ndarray, guess: np.ndarray) -> Matches:

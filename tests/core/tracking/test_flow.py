@@ -135,6 +135,15 @@ def test_coarse_flows_come_near(flow: DenseInverseSearch | FeatureFlow, shift: t
     assert np.median(error) < 1.0
 
 
+@pytest.mark.parametrize("rows", [24, 32, 48, 56])
+def test_images_of_few_rows_have_a_flow(rows: int) -> None:
+    """OpenCV's ends the process on most of them."""
+    first, second = (shifted(texture(2, 3.0), *shift).gray[:rows] for shift in ((0.0, 0.0), (4.0, -2.0)))
+    field = DenseInverseSearch().field(TrackingImage(0, 0.0, first.copy()), TrackingImage(1, 0.1, second.copy()))
+    assert field.shape == (rows // 2, SIZE[1] // 2, 2)
+    np.testing.assert_allclose(np.median(field.reshape(-1, 2), axis=0), [4.0, -2.0], atol=0.5)
+
+
 def test_propagate_takes_the_median_of_the_nearest() -> None:
     points = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [100.0, 0.0]])
     displacement = np.array([[1.0, 0.0], [1.0, 0.0], [50.0, 0.0], [7.0, 7.0]])
