@@ -27,7 +27,7 @@ def target_size(size: Size, native: tuple[int, int]) -> tuple[int, int]:
         fitted = fit_size(*native, area=size) if size > 0 else (0, 0)
         if min(fitted) < SMALLEST:
             raise ValueError(
-                f"size={size} is too small a count of pixels: a side of {native[1]}x{native[0]} would be below {SMALLEST}"
+                f"size={size} is too few pixels: a side of {native[1]}x{native[0]} would be below {SMALLEST}"
             )
         return fitted
     if len(size) != 2 or any(side < SMALLEST for side in size):
