@@ -11,7 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.support.launches import DOWN, Launch, launch, lives
+from tests.support.launches import DOWN, Launch, gone, launch, lives
 from tests.support.patience import Stopwatch
 
 pytestmark = pytest.mark.slow
@@ -46,6 +46,23 @@ def test_a_service_that_is_stopped_saves_what_it_has(launch: type[Launch], tmp_p
     code, out, _ = run.finish()
     assert (code, "stopped by SIGTERM" in out) == (128 + signal.SIGTERM, True)
     assert run.report()["reason"] == "stopped by SIGTERM"
+    assert saved.read_text() == "stopped (SIGTERM)"
+
+
+def test_a_neighbor_that_is_told_first_is_not_what_stops_a_node(launch: type[Launch], tmp_path: Path) -> None:
+    """Whoever tells the processes of a service one by one may be slow: the first is gone before the next one hears."""
+    saved = tmp_path / "saved"
+    run = launch(*SLOW_TO_SAVE, f"relay.saved={saved}")
+    run.wait_until_running()
+    relay, sink = run.node("relay"), run.node("sink")
+    run.process.send_signal(signal.SIGSTOP)  # it must not tell them before
+    sink.terminate()
+    assert gone([sink], DOWN)
+    relay.terminate()
+    assert gone([relay], DOWN)
+    run.process.send_signal(signal.SIGTERM)
+    run.process.send_signal(signal.SIGCONT)
+    run.finish()
     assert saved.read_text() == "stopped (SIGTERM)"
 
 

@@ -45,7 +45,11 @@ def run(spec: Spec, signals: Signals) -> int:
     """Runs the node to its end; exit code."""
     process = _Process(spec, signals)
     try:
-        process.run()
+        try:
+            process.run()
+        except PeerLost:
+            signals.check_soon()
+            raise
     except Stopped as stop:
         process.abort("stopped", str(stop))
         return 128 + stop.number

@@ -11,9 +11,11 @@ from __future__ import annotations
 
 import faulthandler
 import signal
+import time
 
 STOP_SECONDS = 3.7  # from the signal that stops a process to its end, wherever it is; its launcher waits longer
 ABORT_SECONDS = 3.0  # that a node has to save what must not be lost
+TOLD_SECONDS = 0.5  # between the first and the last process of a graph, where all are told to stop one by one
 STARTING = {signal.SIGINT, signal.SIGUSR1}  # a launcher starts a node with these blocked, until it can handle them
 
 
@@ -45,6 +47,14 @@ class Signals:
         """Raises Stopped once the node is to stop: to be called at every safe point."""
         if self._stopped_by is not None:
             raise Stopped(self._stopped_by)
+
+    def check_soon(self) -> None:
+        """For a node that has lost another one, which may be the first of all to be told to stop: raises Stopped if a
+        signal comes within TOLD_SECONDS."""
+        until = time.monotonic() + TOLD_SECONDS
+        while time.monotonic() < until:
+            self.check()
+            time.sleep(0.01)
 
     def _interrupt(self, number: int, frame: object) -> None:
         if self.interrupted and self.by_hand:
