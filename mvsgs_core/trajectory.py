@@ -81,8 +81,8 @@ class Trajectory:
         """The part that a map shows, moved to where that has its keyframes (K,), by index: world_from_cam (K, 4, 4).
 
         The frames between two of them move as they do, on the screw from one motion to the other, linear in time;
-        those before the first and after the last move as that one. Time is as `along` has it. Photographs in any order
-        move as the keyframe does that is nearest in space.
+        those before the first and after the last move as that one, and repeated ones as the first of them. Time is as
+        `along` has it. Photographs in any order move as the keyframe does that is nearest in space.
         """
         order = np.argsort(keyframes)
         shown = self.main(keyframes)
@@ -93,6 +93,8 @@ class Trajectory:
         if np.array_equal(known, self.world_from_cam[anchors]):
             return self
         poses, main = self.world_from_cam.copy(), np.flatnonzero(shown)
+        again = repeated(poses[main]) & ~np.isin(main, anchors)
+        first = main[np.maximum.accumulate(np.where(again, 0, np.arange(len(main))))]
         origin = poses[anchors[0], :3, 3].copy()  # the world's may be far away
         poses[:, :3, 3] -= origin
         target = known.copy()
@@ -108,6 +110,7 @@ class Trajectory:
         poses[main] = moves[before] @ geometry.se3_exp((place - before)[:, None] * change) @ poses[main]
         poses[:, :3, 3] += origin
         poses[anchors] = known
+        poses[main] = poses[first]
         return replace(self, world_from_cam=poses)
 
 
@@ -128,17 +131,29 @@ def velocities(timestamps: np.ndarray, world_from_cam: np.ndarray, known: np.nda
     """Camera velocities (N, 6) by the `known` (N,) neighbors in time of each frame; 0 where there is none.
 
     A twist (translation, rotation) a second in the camera's own axes, in the unit of the poses. timestamps: (N,)
-    seconds; of frames whose times stand still or go back it is 0. world_from_cam: (N, 4, 4).
+    seconds; of frames whose times stand still or go back it is 0. world_from_cam: (N, 4, 4). Frames that have the pose
+    of the one before are that image again, as in a video of 15 frames a second that is shown at 30: the velocity is
+    that between the images before and after. Over a longer time, the camera rests.
     """
     result = np.zeros((len(timestamps), 6))
     order = np.flatnonzero(known)
-    for k, n in enumerate(order):
-        around = [m for m in order[max(k - 1, 0) : k + 2] if abs(timestamps[m] - timestamps[n]) < LONGEST_GAP]
+    begins = np.flatnonzero(~repeated(world_from_cam[order]))
+    new = order[begins]
+    for k, same in enumerate(np.split(order, begins[1:])):
+        around = [m for m in new[max(k - 1, 0) : k + 2] if abs(timestamps[m] - timestamps[new[k]]) < LONGEST_GAP]
         seconds = timestamps[around[-1]] - timestamps[around[0]]
-        if seconds > 0.0 and (np.diff(timestamps[around]) > 0.0).all():
+        rests = timestamps[same[-1]] - timestamps[same[0]] >= LONGEST_GAP
+        if not rests and seconds > 0.0 and (np.diff(timestamps[around]) > 0.0).all():
             moved = geometry.inverse(world_from_cam[around[0]]) @ world_from_cam[around[-1]]
-            result[n] = geometry.se3_log(moved) / seconds
+            result[same] = geometry.se3_log(moved) / seconds
     return result
 
 
-__all__ = ["LONGEST_GAP", "TrackingState", "Trajectory", "along", "nearest", "velocities"]
+def repeated(world_from_cam: np.ndarray) -> np.ndarray:
+    """(N,) bool: frames (N, 4, 4) with the pose of the one before, against which they did not move."""
+    again = np.zeros(len(world_from_cam), bool)
+    again[1:] = (world_from_cam[1:] == world_from_cam[:-1]).all(axis=(1, 2))
+    return again
+
+
+__all__ = ["LONGEST_GAP", "TrackingState", "Trajectory", "along", "nearest", "repeated", "velocities"]

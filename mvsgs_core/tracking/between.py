@@ -129,9 +129,15 @@ def spared(frames: Mapping[int, TrackingImage]) -> int:
 
 
 def _with_neighbors(records: list[FrameRecord], indices: Set[int]) -> list[FrameRecord]:
-    """Of these frames, of those before and after them, and of what these did not move against."""
+    """Of these frames, of those before and after them that show something else, and of what these did not move
+    against."""
     place = partial(place_of, records)
-    near = {n for index in indices for n in range(max(place(index) - 1, 0), min(place(index) + 2, len(records)))}
+    near = set()
+    for n in map(place, indices):
+        after = n + 1
+        while after < len(records) and records[after].same_as == records[n].index:
+            after += 1
+        near |= set(range(max(n - 1, 0), min(after + 1, len(records))))
     near |= {place(origin) for origin in (records[n].same_as for n in near) if origin is not None}
     return [records[n] for n in sorted(near)]
 

@@ -72,7 +72,8 @@ class FrontEnd:
         """Starts over from a new reference keyframe, which is also the last frame."""
         self.reference = self.last = image
         self.propagated = image.cells.points.astype(np.float64)
-        self.step = None
+        itself = Matches(self.propagated, image.cells.textured.astype(np.float64))
+        self.step = Step(image.index, itself, 1.0, 0.0, False, None)
 
     def resume(self, reference: TrackingImage, image: TrackingImage, matches: Matches, pose: np.ndarray | None) -> None:
         """Goes on from a frame whose matches with another keyframe, and pose (4, 4), are known."""
@@ -83,6 +84,7 @@ class FrontEnd:
         )
         self.propagated = np.where(alive[:, None], matches.target, near)
         self.last, self.pose = image, pose
+        self.step = Step(reference.index, matches, 1.0, 0.0, False, None)
 
     def found(self, place: PlaceMatch) -> Step:
         """Of a frame in which a keyframe was found."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mvsgs_core import geometry
-from mvsgs_core.trajectory import Trajectory
+from mvsgs_core.trajectory import Trajectory, velocities
 
 N = 13
 FAR = np.array([1e6, -2e6, 3e6])
@@ -79,6 +79,35 @@ def test_frames_without_a_pose_and_other_parts_of_the_map_stay() -> None:
     assert np.isnan(after.world_from_cam[4]).all()
     np.testing.assert_array_equal(after.world_from_cam[11:], poses[11:])
     np.testing.assert_allclose(after.world_from_cam[5, 0, 3], poses[5, 0, 3] + 0.5)
+
+
+@pytest.mark.parametrize("times", [1, 2, 4])
+def test_an_image_that_is_shown_again_moves_as_the_camera_did_when_it_was_taken(times: int) -> None:
+    """As in a video of 15 frames a second that is shown at 30 or 60."""
+    twist = np.array([0.02, 0.01, -0.02, 0.003, 0.04, -0.002])
+    taken = geometry.se3_exp(np.arange(8)[:, None] * twist)
+    shown = np.repeat(taken, times, axis=0)
+    seconds = np.arange(len(shown)) / (15.0 * times)
+    found = velocities(seconds, shown, np.ones(len(shown), bool))
+    np.testing.assert_allclose(found, np.tile(15.0 * twist, (len(shown), 1)), atol=1e-9)
+
+
+def test_a_camera_that_rests_has_no_velocity() -> None:
+    poses = np.tile(np.eye(4), (13, 1, 1))
+    poses[:3, 0, 3], poses[10:, 0, 3] = [-3.0, -2.0, -1.0], [1.0, 2.0, 3.0]
+    found = velocities(np.arange(13) / 20.0, poses, np.ones(13, bool))  # it rests for 0.3 s
+    np.testing.assert_allclose(found[:, 0], [20.0] * 3 + [0.0] * 7 + [20.0] * 3, atol=1e-9)
+
+
+def test_an_image_that_is_shown_again_follows_a_keyframe_as_the_first_time() -> None:
+    before = tracked()
+    poses = before.world_from_cam.copy()
+    poses[[2, 4, 7, 8]] = poses[[1, 3, 6, 6]]
+    before, target = replace(before, world_from_cam=poses), poses[KEYFRAMES].copy()
+    target[1] = moved(target[1], geometry.se3_exp(np.array([0.02, 0.01, -0.02, 0.003, 0.004, -0.002])))
+    after = before.following(KEYFRAMES, target).world_from_cam
+    np.testing.assert_array_equal(after[[2, 4, 7, 8]], after[[1, 3, 6, 6]])
+    np.testing.assert_array_equal(after[KEYFRAMES], target)
 
 
 def test_where_no_keyframe_moved_nothing_does() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking import initializer
-from mvsgs_core.tracking.between import HELD, FramesBetween
+from mvsgs_core.tracking.between import HELD, FramesBetween, _with_neighbors
 from mvsgs_core.tracking.frames import FrameRecord
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
@@ -91,3 +91,12 @@ def test_few_frames_wait_with_keyframes_that_wait_themselves_spread_evenly() -> 
     between.reopen()
     assert between.waiting == {*kept, 21}, "the keyframes are solved"
     assert between.close() == set(kept)
+
+
+def test_around_a_frame_are_those_that_show_something_else() -> None:
+    """Its velocity is that between them, however often an image is shown."""
+    records = [
+        FrameRecord(n, n / 20.0, TrackingState.TRACKED, same_as=None if n % 4 == 0 else n - n % 4) for n in range(16)
+    ]
+    assert [r.index for r in _with_neighbors(records, {4})] == [0, 3, 4, 5, 6, 7, 8]
+    assert [r.index for r in _with_neighbors(records, {12})] == [8, 11, 12, 13, 14, 15]

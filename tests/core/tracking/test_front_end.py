@@ -172,6 +172,13 @@ def test_tracking_resumes_from_another_keyframe() -> None:
     assert max(pose_error(step.pose, true_pose(6))) < 0.005
 
 
+def test_an_image_that_is_shown_again_rests_after_it_was_found_in_the_map() -> None:
+    made = front_end(0, 6, 12)
+    made.resume(image(12), image(8), exact_matches(made.graph, 12, true_pose(8)), true_pose(8))
+    step = made.follow(replace(image(8), index=9), with_pose=True)
+    assert (step.still, step.reference) == (True, 12)
+
+
 def test_the_images_velocity_is_that_of_the_flow() -> None:
     made = front_end(0)
     made.refer_to(at(0, 1.0))
@@ -224,3 +231,20 @@ def test_what_changes_where_it_is_masked_is_no_motion() -> None:
     made.refer_to(through_a_slit(0, masked=True))
     made.follow(through_a_slit(6, masked=True), with_pose=False)
     assert made.follow(replace(through_a_slit(6, masked=True, beside=60), index=7), with_pose=False).still
+
+
+def test_an_image_that_is_shown_again_rests_right_after_its_keyframe_too() -> None:
+    """As in a video of 15 frames a second that is shown at 30: no velocity and no pose are its own."""
+    made = front_end(0)
+    noise = np.random.default_rng(0).normal(0.0, 0.5, (240, 320))
+    again = at(0, 1.1)
+    again = replace(again, index=1, gray=np.clip(again.gray + noise, 0, 255).round().astype(np.uint8))
+    made.refer_to(at(0, 1.0))
+    step = made.follow(again, with_pose=True)
+    assert (step.still, step.reference) == (True, 0)
+    seen = step.matches.alive
+    np.testing.assert_array_equal(step.matches.target[seen], made.graph.keyframes[0].points[seen])
+    assert again.velocity is None
+    later = at(2, 1.2)
+    assert not made.follow(later, with_pose=True).still
+    assert later.velocity is not None
