@@ -171,6 +171,8 @@ class FrontEnd:
         seen: (M,) bool, points found in the last image. moves: (M, 2) their flow since.
         """
         assert self.last is not None
+        if not seen.any():
+            return False
         limit, flow = self.config.still_flow * image.longer_side, _median_norm(moves[seen])
         if image.mask is not None and limit <= flow < BESIDE * limit:
             unchanged = replace(image, gray=np.where(image.mask, image.gray, self.last.gray))
@@ -184,7 +186,7 @@ class FrontEnd:
 
 
 def _median_norm(vectors: np.ndarray) -> float:
-    """Of (N, 2); NaN of none."""
+    """Of (N, 2), at least one."""
     return float(np.median(np.linalg.norm(vectors, axis=1)))
 
 
