@@ -15,7 +15,8 @@ from mvsgs_core.datasets.files import UnreadableImageError, opened_image, uprigh
 from mvsgs_core.datasets.lens import Lens, guess_lens
 
 FISHEYE = "fisheye"  # first of the distortion: what follows are the four coefficients of OpenCV's fisheye model
-_SEEN = 0.9  # of an image, about its middle: where principal points are of pictures that were not cropped
+_NEAR = 0.1  # of half of a side, from the middle: there the principal point is of nearly all cameras
+_SEEN = 0.9  # of half of a side, from the middle: there it is of all pictures that were not cropped
 
 
 def lens_from_option(
@@ -60,15 +61,29 @@ def check_lens_option(
 
 
 def size_doubt(lens: Lens) -> list[str]:
-    """What to say of intrinsics that look like those of images of another size than the lens's."""
-    (height, width), (_, _, cx, cy) = lens.size, lens.intrinsics
-    if abs(2 * cx + 1 - width) <= _SEEN * width and abs(2 * cy + 1 - height) <= _SEEN * height:
+    """What to say of intrinsics that look like those of images of another size than the lens's, or of turned ones."""
+    (height, width), (fx, fy, cx, cy) = lens.size, lens.intrinsics
+    off = _off_middle(lens, lens.size)
+    if _off_middle(lens, (width, height)) <= _NEAR and off > 2 * _NEAR:
+        turned = f" (turned: [{fy:g},{fx:g},{cy:g},{cx:g}])" if fx != fy else ""
+        return [
+            f"the principal point cx, cy = {cx:g}, {cy:g} is that of images of {height}x{width}, and these are "
+            f"{width}x{height}: if the two were exchanged, or the camera was turned after its calibration, give "
+            f"dataset.intrinsics=[{fx:g},{fy:g},{cy:g},{cx:g}]{turned}"
+        ]
+    if off <= _SEEN:
         return []
     such = f" (about {2 * cx + 1:.0f}x{2 * cy + 1:.0f})" if min(cx, cy) > 0 else ""
     return [
         f"the principal point cx, cy = {cx:g}, {cy:g} lies at the border of images of {width}x{height} or outside: "
         f"unless they were cropped, the intrinsics are those of another size{such} and must be scaled to theirs"
     ]
+
+
+def _off_middle(lens: Lens, size: tuple[int, int]) -> float:
+    """How far the principal point lies from the middle of images (height, width), in parts of half of a side."""
+    (height, width), (_, _, cx, cy) = size, lens.intrinsics
+    return max(abs(2 * cx + 1 - width) / width, abs(2 * cy + 1 - height) / height)
 
 
 def lens_of_matrix(matrix: np.ndarray, size: tuple[int, int]) -> Lens:

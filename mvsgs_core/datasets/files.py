@@ -6,14 +6,14 @@ import importlib
 import math
 import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import Image, ImageFile, ImageOps
 
 from mvsgs_core.bad_file import BadFileError, brief, reading
 
@@ -64,7 +64,7 @@ class UnreadableImageError(BadFileError):
 
 
 @contextmanager
-def opened_image(source: Path | BinaryIO, name: str) -> Iterator[Image.Image]:
+def opened_image(source: Path | BinaryIO, name: str) -> Iterator[ImageFile.ImageFile]:
     """An image of which the header is read and nothing decoded yet.
 
     Raises UnreadableImageError, naming it `name`, for more than MAX_PIXELS pixels, and for whatever Pillow raises while
@@ -98,17 +98,44 @@ def read_image(
     a format that can be decoded at a half, a quarter or an eighth of its size, as JPEG, is where so many are left.
     Raises UnreadableImageError.
     """
-    with opened_image(source, name or (source.name if isinstance(source, Path) else "image")) as opened:
+    name = name or (source.name if isinstance(source, Path) else "image")
+    with opened_image(source, name) as opened:
         if enough is not None:
             factor = min(1.0, (enough / (opened.width * opened.height)) ** 0.5)
             opened.draft("RGB", (math.ceil(factor * opened.width), math.ceil(factor * opened.height)))
         image: Image.Image = opened
         if turn_upright:
             image = ImageOps.exif_transpose(opened)
-        if image.mode.startswith("I;16"):  # 16-bit gray: Pillow's own conversion would clip it at 255
+        gray_16 = image.mode.startswith("I;16") or (image.mode == "I" and opened.format == "PPM")
+        if image.mode in ("I", "F") and not gray_16:
+            fractions = image.mode == "F"
+            command = f"mkdir converted; mogrify -path converted -format png -depth 16 *{Path(name).suffix}"
+            raise UnreadableImageError(
+                f"{name}: its values are {'fractions' if fractions else '32-bit integers'}, of which nothing says what "
+                "is white: convert all images by one scale to 8 or 16 bit"
+                + (f" (where 1 is white, with ImageMagick: {command})" if fractions else "")
+            )
+        if gray_16:  # Pillow's own conversion would clip it at 255
             gray = (np.asarray(image) >> 8).astype(np.uint8)
             return np.repeat(gray[..., None], 3, axis=-1)
         return np.array(image.convert("RGB"))
+
+
+def dark_16_bit(paths: Sequence[Path]) -> bool:
+    """Whether these images have 16 bits a channel, and none a value above 4095: as where 12 bits are stored in them.
+
+    Those that cannot be read are no matter.
+    """
+    deep = False
+    for path in paths:
+        with suppress(UnreadableImageError):
+            with opened_image(path, path.name) as opened:
+                if not any(";16" in str(tile.args) for tile in opened.tile):
+                    return False
+            if read_image(path).max() >= 16:
+                return False
+            deep = True
+    return deep
 
 
 def upright_size(image: Image.Image) -> tuple[int, int]:

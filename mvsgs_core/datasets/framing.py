@@ -7,13 +7,14 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.camera import fit_size, resize_image, scale_intrinsics
 from mvsgs_core.datasets.lens import Lens, Undistortion
 
 Size = tuple[int, int] | Sequence[int] | int | None
 # Pixels of a frame where no size was asked for: robots' cameras (1280x1024) stay as they are; 4K would take hours.
 LARGEST = 1_500_000
-SMALLEST = 12  # pixels of a side that is asked for: on smaller ones nothing is found, and flows fail
+SMALLEST = 12  # pixels of a side: on smaller ones nothing is found, and flows fail
 _KEPT = 4  # undistortion maps in memory: most sequences have one camera, some a camera for each image
 
 
@@ -66,10 +67,18 @@ class Framing:
         self._undistortions: dict[Lens, Undistortion] = {}
 
     def size_of(self, native: tuple[int, int]) -> tuple[int, int]:
-        """(height, width) of what an image of size `native` becomes."""
+        """(height, width) of what an image of size `native` becomes. Raises BadFileError where that is too small."""
         if self._size is None and self._crop:  # nothing to resize to, so cropping makes the image smaller
-            return native[0] - 2 * self._crop, native[1] - 2 * self._crop
-        return target_size(self._size, native)
+            size = native[0] - 2 * self._crop, native[1] - 2 * self._crop
+        else:
+            size = target_size(self._size, native)
+        if min(size) < SMALLEST:
+            less, remedy = (f" less {self._crop} on each side", " or a smaller crop") if self._crop else ("", "")
+            raise BadFileError(
+                f"images of {native[1]}x{native[0]} pixels{less} are too small, {SMALLEST} a side are the least: "
+                f"take larger ones{remedy}"
+            )
+        return size
 
     def notice(self, native: tuple[int, int]) -> list[str]:
         """What to say where images of size `native` are made smaller though nobody asked for that."""

@@ -13,12 +13,14 @@ import numpy as np
 from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.datasets import Item
 from mvsgs_core.datasets.calibration import lens_for_images, with_distortion
-from mvsgs_core.datasets.files import UnreadableImageError, read_depth, read_image
+from mvsgs_core.datasets.files import UnreadableImageError, dark_16_bit, read_depth, read_image
 from mvsgs_core.datasets.framing import Framing, same_shape
 from mvsgs_core.datasets.gps import CLOCK, clock_time, read_gps
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.masks import CameraMask, masks_of, read_alpha, read_mask
 from mvsgs_core.datasets.options import FileOptions
+
+_SAMPLED = 5  # images at most, for what is the same in all of them
 
 
 @dataclass(frozen=True)
@@ -162,7 +164,17 @@ class ImageSequence(FileReader, ABC):
             raise ValueError(f"no frame left: the sequence has {count}, wanted from {self.start} to {self.stop}")
         self._check_distortion(self.lens)
         self._depth_format, self._turn_upright, self._size = found.depth_format, found.turn_upright, found.size
+        if self._size is not None:
+            self._framing.size_of(self._size)  # refused here, before its steps are measured
         self._find_masks()
+        sample = [record.image for record in self.records[:: -(-len(self.records) // _SAMPLED)]]
+        if dark_16_bit(sample):
+            self.warnings.append(
+                f"none of {len(sample)} images, such as {sample[0].name}, has a value above 4095 of 65535, as where 12 "
+                "bits are stored in 16: they are read nearly black. Multiply the values of all by one number (16 for "
+                "12 bits), with ImageMagick in their folder: mkdir bright; mogrify -path bright -evaluate multiply 16 "
+                f"*{sample[0].suffix}"
+            )
         self._named: dict[Path, np.ndarray] = {}
         self._find_named_places()
         self._opening_warnings = len(self.warnings)

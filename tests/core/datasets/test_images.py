@@ -254,6 +254,15 @@ def test_natural_order_and_subfolders(tmp_path: Path) -> None:
     assert any("of another size (about 128x96)" in w for w in large.warnings)
 
 
+def test_a_calibration_of_turned_images_is_said_with_the_numbers_to_give(tmp_path: Path) -> None:
+    write_photos(tmp_path, 2)  # of 64x48
+    (told,) = open_dataset("images", path=tmp_path, intrinsics=[50, 51, 24, 31]).warnings
+    assert "is that of images of 48x64, and these are 64x48" in told
+    assert "dataset.intrinsics=[50,51,31,24] (turned: [51,50,31,24])" in told
+    for center in ((31, 24), (29, 26), (27, 27), (24, 24), (20, 31)):  # in the middle, off it, of a cropped picture
+        assert not open_dataset("images", path=tmp_path, intrinsics=[50, 51, *center]).warnings
+
+
 def test_without_calibration_it_says_what_to_do(tmp_path: Path) -> None:
     write_photos(tmp_path, 2)
     uncalibrated = open_dataset("images", path=tmp_path)

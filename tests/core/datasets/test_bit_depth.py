@@ -1,0 +1,46 @@
+"""Images of more than 8 bits: read as bright as they are, or refused, or said to be dark."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mvsgs_core.bad_file import BadFileError
+from mvsgs_core.datasets import open_dataset
+
+
+@pytest.mark.parametrize(("kind", "said"), [(np.int32, "32-bit integers"), (np.float32, "fractions")])
+def test_values_of_which_nothing_says_what_is_white_are_refused(tmp_path: Path, kind: type, said: str) -> None:
+    for i in range(2):
+        Image.fromarray((np.arange(48 * 64).reshape(48, 64) / 3071).astype(kind)).save(tmp_path / f"{i}.tif")
+    with pytest.raises(BadFileError, match=f"0.tif: its values are {said}.* convert all images by one scale"):
+        list(open_dataset("images", path=tmp_path, intrinsics=[50, 51, 31, 24]))
+
+
+def test_16_bit_gray_is_read_whatever_its_file(tmp_path: Path) -> None:
+    gray = np.linspace(0, 65535, 48 * 64).reshape(48, 64).astype(np.uint16)
+    for name in ("a.png", "b.tif"):
+        Image.fromarray(gray).save(tmp_path / name)
+    (tmp_path / "c.ppm").write_bytes(b"P5 64 48 65535\n" + gray.astype(">u2").tobytes())
+    sequence = open_dataset("images", path=tmp_path, intrinsics=[50, 51, 31, 24])
+    for item in sequence:
+        assert (item.image == (gray >> 8)[..., None]).all()
+    assert not sequence.warnings
+
+
+def test_of_12_bits_in_16_it_is_said_what_to_do(tmp_path: Path) -> None:
+    def warnings(values: int, last: int) -> list[str]:
+        for i in range(9):
+            gray = np.full((48, 64), last if i == 8 else values // (i + 1), dtype=np.uint16)
+            Image.fromarray(gray).save(tmp_path / f"{i}.png")
+        return open_dataset("images", path=tmp_path, intrinsics=[50, 51, 31, 24]).warnings
+
+    (told,) = warnings(4095, 300)
+    assert "has a value above 4095 of 65535" in told
+    assert "mogrify -path bright -evaluate multiply 16 *.png" in told
+    assert not warnings(4095, 4096), "a dark picture among others"
+    Image.fromarray(np.full((48, 64), 3, dtype=np.uint8)).save(tmp_path / "8.png")
+    assert not open_dataset("images", path=tmp_path, start=8, intrinsics=[50, 51, 31, 24]).warnings, "8 bits"
