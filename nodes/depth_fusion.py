@@ -59,17 +59,17 @@ class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
 
     def _why_nothing(self) -> str:
         counts = self.stats.counts
-        keyframes, known = f"{int(counts['keyframes'])} keyframes", counts["pixels known"]
-        if not known:
+        keyframes, filtered = f"{int(counts['keyframes'])} keyframes", counts["pixels with depth"]
+        if not filtered:
             return f"none of {keyframes} has a pixel with stereo depth"
         start = "pixels rejected: "
         rejected = {name.removeprefix(start): n for name, n in counts.items() if name.startswith(start) and n}
         fractions = [
-            f"{name} {100 * n / known:.0f} %" for name, n in sorted(rejected.items(), key=lambda item: -item[1])
+            f"{name} {100 * n / filtered:.0f} %" for name, n in sorted(rejected.items(), key=lambda item: -item[1])
         ]
         return (
-            f"all depth of {keyframes} was rejected, by these filters, of the pixels with stereo depth: "
-            f"{', '.join(fractions)} (a pixel can fail more than one)"
+            f"all depth of {keyframes} was rejected, by these filters, of the pixels with stereo depth, "
+            f"their own or neighbors': {', '.join(fractions)} (a pixel can fail more than one)"
         )
 
     def _queue(self) -> int:

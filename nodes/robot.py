@@ -48,7 +48,7 @@ class Robot(LiveSource):
             raise ValueError(str(error)) from error
 
     def _open(self) -> None:
-        """Raises TransportError for an address that is none and for refused keys."""
+        """Raises TransportError for an address that is none and for keys that cannot be read."""
         keys = None if self.config.keys is None else load_keys(Path(self.config.keys))
         if (host := unknown_host(self.config.path)) is not None:
             self.stats.warn(f"nobody here knows a host {host}: is its name right, and is it in the network?")
@@ -66,11 +66,19 @@ class Robot(LiveSource):
         return f"no usable frame from {self.config.path}"
 
     def _hint(self) -> str:
+        if self._reader.met:
+            return (
+                "a program answers there, but nothing that it sends is a message of this system: it must publish "
+                "Frames as examples/robot.py does (msgs/WIRE.md has their form)"
+            )
         return "is the program that publishes there running (see examples/robot.py)?"
 
     def _next(self, seconds: float) -> Frame | End | None:
+        """Raises ConnectionError where the robot refuses the keys."""
         try:
             message = self._reader.receive(seconds)
+        except TransportError as error:  # a user's matter, which no traceback explains
+            raise ConnectionError(str(error)) from error
         except CodecError as error:
             self.stats.warn(f"the robot sent what is no Frame, it was left out: {error}")
             return None

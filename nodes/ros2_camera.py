@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from nodes.ros2.dds import Reader
 
 UNSTAMPED = 1.0  # s for which images without a time stamp are left out: a simulation may have no clock yet
+SAME = 1e-3  # relative difference of intrinsics that is no other calibration
 POLL = 0.1  # s at most between two looks at the clock and at what was lost
 
 
@@ -67,6 +68,8 @@ class Ros2Camera(LiveSource):
         self._topic = c.topic(c.path)
         self._info_topic = c.topic(c.info_topic) if c.info_topic else camera_info_topic(self._topic)
         self._lens: Lens | None = None
+        self._undone: Lens | None = None  # of the last CameraInfo whose distortion could be taken out
+        self._warned_of_lens = False
         self._uncalibrated_since: float | None = None  # the first image without
         self._met = False  # somebody who publishes them
         # by time.monotonic, when images without a time stamp get the time here; None: none came, inf: others have one
@@ -193,8 +196,10 @@ class Ros2Camera(LiveSource):
         return None
 
     def _lens_for(self, native: tuple[int, int]) -> Lens | None:
-        """The lens of the stream; None as long as its CameraInfo is waited for."""
-        if self._lens is None:
+        """The lens of the stream, one for all of it; None as long as its CameraInfo is waited for."""
+        if self._lens is not None:
+            self._note_other_lens(native, self._lens)
+        else:
             lens = self._given_lens(native) or self._calibrated_lens(native) or self._guessed_lens(native)
             self._lens = lens.at(native) if lens is not None and same_shape(native, lens.size) else lens
         if self._lens is None:
@@ -206,6 +211,31 @@ class Ros2Camera(LiveSource):
             self.stats.values[LENS] = lens_values(self._lens)
         return self._lens
 
+    def _note_other_lens(self, native: tuple[int, int], ours: Lens) -> None:
+        """Says where a CameraInfo comes that is not the one in use."""
+        if self._warned_of_lens or self.config.intrinsics is not None:
+            return
+        lens = self._calibrated_lens(native)
+        if lens is None:
+            return
+        theirs = lens.at(ours.size) if same_shape(ours.size, lens.size) else lens
+        same_bend = (theirs.distortion, theirs.fisheye) == (ours.distortion, ours.fisheye)
+        if same_bend and not ours.guessed and np.allclose(theirs.intrinsics, ours.intrinsics, rtol=SAME):
+            return
+        self._warned_of_lens = True
+        if ours.guessed:
+            self.stats.warn(
+                f"a calibration came at {self._info_topic} after the focal length was guessed, and is not used: start "
+                f"again, now that it is sent, or wait longer for it with dataset.info_timeout (s, "
+                f"{self.config.info_timeout:g} now)"
+            )
+        else:
+            self.stats.warn(
+                f"the calibration at {self._info_topic} changed while the stream ran (fx {ours.intrinsics[0]:.1f}, now "
+                f"{theirs.intrinsics[0]:.1f}), and the first one is used on: fix the camera's zoom and focus, or start "
+                "again after each change"
+            )
+
     def _given_lens(self, native: tuple[int, int], otherwise: str | None = None) -> Lens | None:
         intrinsics = otherwise if self.config.intrinsics is None else self.config.intrinsics
         if intrinsics is None:
@@ -216,13 +246,15 @@ class Ros2Camera(LiveSource):
         return lens
 
     def _calibrated_lens(self, native: tuple[int, int]) -> Lens | None:
-        """Of the first CameraInfo that says anything, and whose distortion can be taken out."""
+        """Of the first new CameraInfo that says anything, and whose distortion can be taken out."""
         for data in self._infos.take():
             try:
                 info = self._infos.decode(data)
                 if calibrated(info):
                     lens = lens_of(info, rectified(self._topic))
-                    Undistortion(lens.at(native), fill=self.config.crop is None)
+                    if lens != self._undone:  # which takes longer than an image
+                        Undistortion(lens.at(native), fill=self.config.crop is None)
+                    self._undone = lens
                     return lens
                 self.stats.warn(f"the CameraInfo at {self._info_topic} is empty: the camera was not calibrated")
             except ValueError as error:  # what is no message (CdrError) and what no camera has

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -15,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import zmq
 
 from bench.faults.frame_mutations import frame as false_frame
 from msgs import End, Frame
@@ -22,9 +24,10 @@ from msgs.codec import NEWEST, encode
 from mvsgs_core.stream_times import StreamTimes
 from nodes.robot import Robot
 from nodes.runtime.addresses import TransportError
+from nodes.runtime.explained import is_explained
 from nodes.runtime.transport import create_keys
 from nodes.runtime.transport.live import LivePublisher, LiveReader
-from tests.support.live_programs import Program, looked_at, received
+from tests.support.live_programs import INTERVAL, Program, looked_at, received
 from tests.support.patience import LONG, until
 from tests.support.ports import tcp_address
 from tests.support.shared_data import ROOT
@@ -269,6 +272,30 @@ def test_only_garbage_is_no_stream_and_the_error_says_what_came(address: str) ->
     program.close()
 
 
+@pytest.mark.parametrize("sent", [b"\xff\xd8\xff\xe0 as a JPEG begins", b""], ids=["a JPEG", "nothing"])
+def test_a_program_that_sends_something_else_is_no_missing_program(address: str, sent: bytes) -> None:
+    """Which a PUB socket does not even hand on to a reader of our messages."""
+    robot = Robot(Robot.Config(path=address, timeout=1.5))
+    with zmq.Context() as context, context.socket(zmq.PUB) as publisher:
+        publisher.bind(address)
+        stop = threading.Event()
+
+        def publish() -> None:
+            while sent and not stop.wait(INTERVAL):
+                publisher.send(sent)
+
+        thread = threading.Thread(target=publish)
+        thread.start()
+        try:
+            with pytest.raises(TimeoutError, match="answers there, but nothing that it sends is a message of this"):
+                list(robot.run())
+        finally:
+            stop.set()
+            thread.join()
+    with pytest.raises(TimeoutError, match="is the program that publishes there running"):
+        list(Robot(Robot.Config(path=address, timeout=0.5)).run())
+
+
 # ---------------------------------------------------------------- the program in examples/
 
 
@@ -316,8 +343,9 @@ def test_a_reader_with_other_keys_is_named_at_both_ends(address: str, video: Pat
         with example("--video", str(video), "--address", address, *given, errors=said) as program:
             try:
                 config = Robot.Config(path=address, timeout=LONG, keys=None if ours is None else str(tmp_path / ours))
-                with pytest.raises(TransportError, match="keys"):
+                with pytest.raises(ConnectionError, match="keys") as raised:
                     list(Robot(config).run())
+                assert is_explained(raised.value), "a user is shown no traceback"
                 wait_until_it_says(said, text)
             finally:
                 program.terminate()

@@ -13,7 +13,8 @@ from mvsgs_core.fusion.interface import FuseOptions, FusionBackend
 from mvsgs_core.fusion.keyframe_depth import KeyframeDepth, depth_maps
 from mvsgs_core.fusion.normals import normals_of
 from mvsgs_core.keyframe_window import WindowedStage
-from mvsgs_core.pace import Effort, Pace
+from mvsgs_core.pace import Effort, Pace, check_efforts, check_share
+from mvsgs_core.setting_ranges import at_least
 
 ANY_DEPTH = 1.0  # relative difference that no two positive depths reach
 EFFORTS = (Effort("full", 1.0), Effort("two neighbors", 0.4), Effort("no neighbor", 0.15))
@@ -42,6 +43,12 @@ class FusionConfig:
     share: float = 0.35  # of a core's time that fusion may take then
     efforts: tuple[int, ...] | None = None  # those that may be made then, by their place among all; null: all
 
+    def __post_init__(self) -> None:
+        at_least(self, lag=0, window=0, neighbors=0, sigma=0, sigma_most=0, violation=0, relative=0)
+        at_least(self, min_neighbor_confidence=0, confidence=0)
+        check_share(self.share)
+        check_efforts(EFFORTS, self.efforts)
+
 
 @dataclass(frozen=True)
 class FusedDepth:
@@ -53,7 +60,8 @@ class FusedDepth:
     confidence: np.ndarray  # (H, W) float32 refined, calibrated
     normals: np.ndarray  # (H, W, 3) float32 camera frame, 0 where depth is 0
     consistent: np.ndarray  # (H, W) uint8 neighbors that agree
-    counts: dict[str, float] = field(default_factory=dict)  # pixels kept, and rejected by each filter
+    # pixels in all, those with depth of their own or of neighbors, and of these those kept, and rejected by each filter
+    counts: dict[str, float] = field(default_factory=dict)
     evidence: np.ndarray | None = None  # (F, H, W) float32 what the confidence was computed from
     problem: str = ""  # a limit that had to be relaxed, or why nothing is kept
     effort: int = 0  # of `EFFORTS`
@@ -128,7 +136,7 @@ def fuse(
     consistent = np.zeros(reference.size, dtype=np.uint8)
     problem = ""
     evidence: np.ndarray | None = None
-    counts: dict[str, float] = {"pixels": float(depth.size), "known": float(known.sum())}
+    counts: dict[str, float] = {"pixels": float(depth.size)}
     if neighbors:
         maps = depth_maps(reference, neighbors)
         within = np.full(reference.size, config.relative, dtype=np.float32)
@@ -156,6 +164,7 @@ def fuse(
     if reference.mask is not None:  # the neighbors may well see what is behind there
         depth = np.where(reference.mask, depth, np.float32(0))
     keep = depth > 0
+    counts["with depth"] = float(keep.sum())
     sure = confidence >= config.confidence
     counts["rejected: confidence"] = float((keep & ~sure).sum())
     if config.check:

@@ -174,6 +174,27 @@ def test_without_calibration_the_focal_length_is_guessed_and_said(peer: Peer, ca
     assert "intrinsics are a guess" in text
 
 
+@pytest.mark.parametrize("change", [{"k": [27.0, *K[1:]]}, {"d": [0.1, 0, 0, 0, 0]}])
+def test_a_calibration_that_changes_is_said_once_and_the_first_one_holds(
+    peer: Peer, camera: str, change: dict[str, Any]
+) -> None:
+    send = sender(peer, camera, [picture(i) for i in range(20)], later=(10, INFO | change))
+    frames, node = received(config(camera), send)
+    assert all(frame.intrinsics == pytest.approx([25.0, 25.0, 15.5, 11.5]) for frame in frames)
+    (told,) = [text for text in node.stats.warnings if "calibration" in text]
+    assert f"the calibration at {camera}/camera_info changed while the stream ran" in told
+    assert "start again after each change" in told
+
+
+def test_a_calibration_that_comes_after_the_guess_is_said_with_what_to_do(peer: Peer, camera: str) -> None:
+    send = sender(peer, camera, [picture(i) for i in range(40)], info=None, later=(35, INFO))
+    frames, node = received(config(camera, info_timeout=0.5), send)
+    assert all(frame.intrinsics_guessed for frame in frames)
+    (told,) = [text for text in node.stats.warnings if "after the focal length was guessed" in text]
+    assert "start again" in told
+    assert "dataset.info_timeout" in told
+
+
 def test_calibration_of_a_camera_that_nobody_calibrated_and_of_none(peer: Peer, camera: str) -> None:
     send = sender(peer, camera, [picture(i) for i in range(40)], INFO | {"k": [0.0] * 9})
     frames, node = received(config(camera, info_timeout=0.5), send)

@@ -75,9 +75,12 @@ def received(config: Ros2Camera.Config, send: Sender, frames: int = 0) -> tuple[
 
 def sender(
     peer: Peer, camera: str, messages: list[Any], info: dict[str, Any] | None = INFO, interval: float = 0.03,
-    name: str = IMAGE, topic: str = "image_raw",
+    name: str = IMAGE, topic: str = "image_raw", later: tuple[int, dict[str, Any]] | None = None,
 ) -> Sender:  # fmt: skip
-    """Sends the calibration with every image, as drivers do; in step with a node that it is given."""
+    """Sends the calibration with every image, as drivers do; in step with a node that it is given.
+
+    later: the calibration from an image of this number on.
+    """
     images, infos = f"{camera}/{topic}", f"{camera}/camera_info"
     peer.advertise(images, name)
     peer.advertise(infos, CALIBRATION)
@@ -88,8 +91,9 @@ def sender(
         if node is not None:  # what comes before it knows of the sender is lost
             until(lambda: hasattr(node, "_infos") and node._images.writers and node._infos.writers)
         for number, message in enumerate(messages, start=1):
-            if info is not None:
-                peer.publish(infos, {"header": stamp(0.0), **info})
+            calibration = info if later is None or number < later[0] else later[1]
+            if calibration is not None:
+                peer.publish(infos, {"header": stamp(0.0), **calibration})
             if isinstance(message, bytes):
                 peer.publish_raw(images, message)
             else:

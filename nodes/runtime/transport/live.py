@@ -49,6 +49,11 @@ class LiveReader(NewestReader):
         self.breaks = 0  # times that the connection to a program that did send broke
         super().__init__(address, type, **options)
 
+    @property
+    def met(self) -> bool:
+        """Whether a publisher let this reader in once, whatever it sends."""
+        return self._met
+
     def watch(self) -> None:
         """Raises TransportError if the publisher refuses this reader's keys and nothing ever came from there."""
         if self._refusal is not None and not self.received:

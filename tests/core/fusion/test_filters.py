@@ -40,6 +40,14 @@ def test_kept_is_what_is_sure_and_agreed_on_and_each_rejection_is_counted() -> N
     assert found.counts["rejected: confidence"] == ((found.unfiltered > 0) & ~sure).sum() > 0
 
 
+def test_what_is_counted_as_rejected_is_a_part_of_what_was_filtered() -> None:
+    views = [view(k, 0.3 * x, size=SIZE) for k, x in enumerate((0, 1, -1, 1.5))]
+    views[0].depth[:, 30:] = 0  # for the neighbors to fill
+    found = fuse(views[0], views[1:], replace(CONFIG, confidence=1.1), NativeFusionBackend(1))
+    assert found.counts["with depth"] == (found.unfiltered > 0).sum() > 2 * (views[0].depth > 0).sum()
+    assert found.counts["rejected: confidence"] == found.counts["with depth"]
+
+
 def test_one_view_that_must_agree_is_the_reference_itself() -> None:
     alone = replace(CONFIG, min_views=1, confidence=0.0, refine=False)
     found = fused(slice(60, 70), config=alone)
