@@ -6,6 +6,7 @@ are. Hydra would refuse one that the file does not have, so it is given `++slot.
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -23,6 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from launch.graph import Graph, Replaced, build_graph
+from launch.named_input import quoted
 from launch.refusal import GraphError
 from launch.settings import Settings
 from nodes.parameters import did_you_mean, parameter_names, plain_values
@@ -82,7 +84,7 @@ def prepare(overrides: Sequence[str], conf: Path = CONF, *, all_choices_known: b
     `all_choices_known` is False where choices can come from other directories: Hydra refuses them then.
     """
     choices = {slot: choices_of(slot, conf) for slot in defaults_of(conf)}
-    overrides = [text if "refine" in choices else _spelled_out(text) for text in overrides]
+    overrides = [in_grammar(text if "refine" in choices else _spelled_out(text)) for text in overrides]
     overrides = [*_implied(overrides, choices, conf), *overrides]
     return [_prepare(text, choices, parameter_names(Settings), all_choices_known) for text in overrides]
 
@@ -170,8 +172,36 @@ def _replaced(config: DictConfig, overrides: Sequence[str]) -> dict[str, Replace
 
 
 def parse(text: str) -> Override:
-    """One override. Raises GraphError for what is none."""
+    """One override, as `in_grammar` has it. Raises GraphError for what is none."""
     try:
-        return OverridesParser.create().parse_override(text)
+        return OverridesParser.create().parse_override(in_grammar(text))
     except HydraException as error:
-        raise GraphError(f"{text}: must look like slot=choice or slot.parameter=value ({error})") from error
+        hint = f"; as a text: {_typed(_in_quotes(text))}" if _parses(_in_quotes(text)) else ""
+        raise GraphError(f"{text}: must look like slot=choice or slot.parameter=value ({error}){hint}") from error
+
+
+def in_grammar(text: str) -> str:
+    """An override whose value is outside of Hydra's grammar, as a path with an umlaut, a "(" or a "=", with that value
+    in quotes; as it is where it can be something else: the beginning of a list or text, an interpolation, a sweep."""
+    value = text.partition("=")[2]
+    if _parses(text) or value.startswith(("'", '"', "[", "{")) or "," in value or "${" in value:
+        return text
+    return _in_quotes(text) if _parses(_in_quotes(text)) else text
+
+
+def _in_quotes(text: str) -> str:
+    key, separator, value = text.partition("=")
+    return f"{key}{separator}{quoted(value)}" if separator else text
+
+
+def _typed(text: str) -> str:
+    """In a shell."""
+    return shlex.quote(text) if set('"$`\\!') & set(text) else f'"{text}"'
+
+
+def _parses(text: str) -> bool:
+    try:
+        OverridesParser.create().parse_override(text)
+    except HydraException:
+        return False
+    return True

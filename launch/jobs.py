@@ -19,7 +19,7 @@ from launch.compose import graph_of
 from launch.graph import Graph
 from launch.inline import run_inline
 from launch.outcome import FAILED, REFUSED, Outcome, finished
-from launch.output import Output
+from launch.output import Output, new_folder
 from launch.printing import say
 from launch.refusal import GraphError
 from launch.screen import Screen, make_screen
@@ -75,6 +75,7 @@ def _run(job: Job) -> int:
     try:
         graph = graph_of(job.config, job.overrides, job.choices)
         check(graph)
+        graph = _in_its_folder(graph, job)
         in_order = all(slot.node.in_stream_order for slot in graph.slots.values())
         output = Output(Path(graph.settings.output), resumable=in_order)
     except GraphError as error:
@@ -104,6 +105,17 @@ def _run(job: Job) -> int:
         raise
     finally:
         output.release()
+
+
+def _in_its_folder(graph: Graph, job: Job) -> Graph:
+    """The graph of a run whose output nobody named, in a folder that is made for it alone."""
+    if job.config.get("output"):
+        return graph
+    folder = str(new_folder(Path(graph.settings.output)))
+    if folder == graph.settings.output:
+        return graph
+    OmegaConf.update(job.config, "output", folder, force_add=True)
+    return graph_of(job.config, job.overrides, job.choices)
 
 
 def refused(error: GraphError) -> int:

@@ -22,7 +22,7 @@ from typing import Any
 from launch.outcome import Outcome
 from launch.refusal import GraphError
 from launch.settings_file import write_settings
-from mvsgs_core.atomic_file import replace_text
+from mvsgs_core.atomic_file import parts_of, replace_text
 from mvsgs_core.kept_map import FOLDER, TRACKER
 from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, checkpoint_info
 from mvsgs_core.passwords import without_passwords
@@ -65,6 +65,7 @@ class Output:
         Raises GraphError where that cannot be written.
         """
         try:
+            self._remove_parts()
             aside = None if resumed else self._move_previous()
             self.write_report({"finished": False, "reason": "still running, or killed with its launcher"})
             write_settings(self.path / CONFIG, config, command)
@@ -117,6 +118,15 @@ class Output:
         (self.path / LOCK).unlink(missing_ok=True)
         os.close(self._lock)
 
+    def _remove_parts(self) -> None:
+        """Of processes that were killed while they wrote a file: nobody else writes here now, the folder is locked."""
+        checkpoint = self.path / FOLDER
+        files = [self.path / name for name in (*RESULTS, REPORT, CONFIG)]
+        images = [folder / "*.png" for folder in (self.path / IMAGES, checkpoint / KEYFRAMES)]
+        for file in (*files, checkpoint / TRACKER, checkpoint / "state-*.npz", *images):
+            for part in parts_of(file):
+                part.unlink(missing_ok=True)
+
     def _move_previous(self) -> Path | None:
         """What an earlier run found goes to a folder of its own, which is returned, so that no run takes another's
         place; what it left without having found anything goes, as it would pass for this run's."""
@@ -151,6 +161,20 @@ def _resume_command(output: Path) -> str | None:
     except ValueError:
         return None
     return shlex.join([sys.executable, str(RUN_ALL), f"resume={output}"])
+
+
+def new_folder(path: Path) -> Path:
+    """Makes a folder of this name, or with the first number behind it that none has: of runs that begin in the same
+    second each gets its own. Raises GraphError."""
+    for folder in _numbered(path):
+        try:
+            folder.mkdir(parents=True)
+        except OSError as error:
+            if folder.exists():
+                continue
+            raise GraphError(f"output={folder}: {error.strerror}") from error
+        return folder
+    raise AssertionError("there is always another number")
 
 
 def others_files(output: Path) -> list[str]:

@@ -35,7 +35,7 @@ try:
     from launch.advice import advised
     from launch.children import python_environment
     from launch.comparison import comparison_page, comparison_text, has_figures
-    from launch.compose import CONF, choices_of, graph_of, prepare
+    from launch.compose import CONF, choices_of, graph_of, in_grammar, prepare
     from launch.graph_text import graph_text
     from launch.help_text import help_text
     from launch.jobs import Job, RunFailed, refused, run
@@ -153,7 +153,8 @@ def hydra_arguments(arguments: Sequence[str]) -> list[str]:
         if not elsewhere and not any(word.startswith(("hydra/", "--config-name", "-cn")) for word in words):
             check_jobs(overrides, conf)
         # each job's output is a numbered directory in the one that was asked for
-        prepared += [f"hydra.sweep.dir={text.partition('=')[2]}" for text in overrides if text.startswith("output=")]
+        output = [in_grammar(text).partition("=")[2] for text in overrides if text.startswith("output=")]
+        prepared += [f"hydra.sweep.dir={folder}" for folder in output]
     return [word for word in words if word not in overrides] + prepared
 
 

@@ -28,6 +28,12 @@ def replacing(file: Path, *, sync: bool = True) -> Iterator[Path]:
         _sync(file.parent)  # the new name too outlives a loss of power
 
 
+def parts_of(file: Path) -> list[Path]:
+    """What processes that were killed while they wrote `file`, whose name may be a pattern, left aside."""
+    found = file.parent.glob(f".{file.stem}.*{file.suffix}")
+    return [p for p in found if p.name.removesuffix(file.suffix).rpartition(".")[2].isdecimal() and p.is_file()]
+
+
 def replace_text(file: Path, text: str) -> None:
     """Writes a text file (UTF-8) in one step: readers see the old one or the new one. Raises OSError."""
     with replacing(file) as aside:

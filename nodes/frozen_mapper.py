@@ -11,11 +11,13 @@ import numpy as np
 
 from msgs import Asked, CameraPose, Frame, Preview, Reply, Request, SplatMap
 from mvsgs_core.kept_map import check_kept_map
+from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.begun import begin_on
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, training_view
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mapping.preview import preview_arrays, seen
+from mvsgs_core.maps.unfinished import what_is_missing
 from mvsgs_core.stats import Stats
 from nodes import Node
 from nodes.once import Once
@@ -42,7 +44,7 @@ class FrozenMapper(Node):
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
         self.check(self.config)
-        self.atlas = begin_on(Path(self.config.map or ""), self.config, Stats())
+        self.atlas = self._begun_on(self.config.map or "")
         self._once = Once(self.stats)
         self._found: Counter[int] = Counter()  # frames in each part of the map
         self._frames: dict[int, Frame] = {}
@@ -79,7 +81,7 @@ class FrozenMapper(Node):
             said = "paused" if request.on else "the stream goes on"
         elif request.asked == Asked.LOAD_MAP and not problem:
             try:
-                self.atlas = begin_on(Path(request.folder), self.config, Stats())
+                self.atlas = self._begun_on(request.folder)
                 self._found.clear()  # parts and poses of the map before
                 self._frames.clear()
                 said = f"the camera is looked for in {request.folder}"
@@ -89,6 +91,12 @@ class FrozenMapper(Node):
 
     def on_end(self) -> Iterator[SplatMap | Preview]:
         yield splat_map(self._mapper.snapshot(), refined=True)
+
+    def _begun_on(self, folder: str) -> Atlas:
+        """Raises ValueError."""
+        if missing := what_is_missing(folder):
+            self.stats.warn(f"{folder}: {missing}")
+        return begin_on(Path(folder), self.config, Stats())
 
     @property
     def _mapper(self) -> OnlineMapper:

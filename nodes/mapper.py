@@ -27,7 +27,9 @@ from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mapping.self_check import why_nothing
 from mvsgs_core.mapping.trainer import FINAL_RATE
 from mvsgs_core.mapping.warm_up import warm_up
+from mvsgs_core.maps.unfinished import what_is_missing
 from mvsgs_core.pace import Effort, Pace
+from mvsgs_core.setting_ranges import at_least
 from nodes import Node
 from nodes.last_seconds import LastSeconds
 from nodes.mapped_messages import frame_between, rgbd_keyframe
@@ -84,17 +86,20 @@ class Mapper(Node):
             self.atlas, resumed = checkpoint.load(Path(self.config.resume), self.config, self.stats)
             self._replay = Replay(self.atlas)
         elif self.config.map is not None:
-            self.atlas = begin_on(Path(self.config.map), self.config, self.stats)
+            self.atlas = self._begun_on(self.config.map)
             self._previews.unshown = True
         self._checkpoints: Checkpointing | None = None
         if self.config.output is not None:
             self._checkpoints = Checkpointing(Path(self.config.output), self.config.checkpoint, self.atlas, resumed)
         self._frozen = False  # frames are only found in the map
+        self._one_before = ""  # where the map is in whose place another was begun on request; empty: none was
+        self._counted_before: dict[str, float] = {}  # up to then
         self._saved = SavedMaps(self.stats)
         warm_up(self.config, self.atlas.current.state.device)
 
     @classmethod
     def check(cls, config: Config) -> None:
+        at_least(config, checkpoint=0)
         if config.training.loss_function is not None:
             loss_function(config.training.loss_function)
         config.refine.check()
@@ -247,6 +252,8 @@ class Mapper(Node):
             saved = None
         kept = "there was nothing to keep of the one before"
         before = kept if saved is None else f"the one before is in {saved.what}"
+        if request.asked != Asked.SAVE_MAP:
+            self._one_before, self._counted_before = before, dict(self.stats.counts)
         if request.asked == Asked.RESET:
             self._go_on_with(Atlas(OnlineMapper(self.config, self.stats)))
             self._frozen = False  # a new map has to grow
@@ -263,13 +270,19 @@ class Mapper(Node):
     def _load(self, folder: str, before: str, reply: Reply) -> Reply:
         """Goes on in a map in which the tracker looks for the camera already."""
         try:
-            self._go_on_with(begin_on(Path(folder), self.config, self.stats))
+            self._go_on_with(self._begun_on(folder))
             self._previews.unshown = True
         except ValueError as error:
             self._go_on_with(Atlas(OnlineMapper(self.config, self.stats)))
             what = f"the camera is looked for in {folder}, but its splats cannot be taken up ({error}); {before}"
             return replace(reply, success=False, message=what)
         return replace(reply, message=f"the camera is looked for in {folder}; {before}")
+
+    def _begun_on(self, folder: str) -> Atlas:
+        """Raises ValueError."""
+        if missing := what_is_missing(folder):
+            self.stats.warn(f"{folder}: {missing}")
+        return begin_on(Path(folder), self.config, self.stats)
 
     def _go_on_with(self, atlas: Atlas) -> None:
         """Another map; what is counted goes on."""
@@ -332,7 +345,9 @@ class Mapper(Node):
     def _check(self) -> None:
         mapper = self.atlas.current
         if not len(mapper.state):
-            self.stats.nothing(why_nothing(self.stats))
+            why = why_nothing(self.stats, self._counted_before)
+            asked = f"another map was begun on request ({self._one_before}); since then " if self._one_before else ""
+            self.stats.nothing(asked + why)
         found = mapper.self_check()
         if found is None:
             return

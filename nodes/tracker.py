@@ -16,6 +16,7 @@ from mvsgs_core.tracking import known_map
 from mvsgs_core.tracking.between import Between
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity
+from mvsgs_core.tracking.matching.flow import check_flow
 from mvsgs_core.tracking.publish import Correction, Update
 from mvsgs_core.tracking.tracker import Tracker as CoreTracker
 from nodes.localization_file import LocalizationFile
@@ -53,6 +54,7 @@ class Tracker(TrackerNode):
 
     @classmethod
     def check(cls, config: Config) -> None:
+        check_flow(config.flow)
         if config.map is not None:
             check_kept_map(config.map)
             known_map.load(tracker_file(config.map))
@@ -170,8 +172,10 @@ class Tracker(TrackerNode):
 
     def _go_on_with(self, core: CoreTracker, request: Request) -> None:
         """Another map; what is there of the one before is kept, and goes out no more."""
+        core.nothing = "no frame came after another map was begun on request"
         if self.core.mapped and not self.only_localizes:
             self._save(request.kept)
+            core.nothing += f"; the one before is in {request.kept}"
         self.stats.warn("another map was begun on request: what is reported is the last one")
         self.core = core
         if self._returning is not None:

@@ -130,6 +130,18 @@ def test_what_has_no_figures_is_said(runs: list[Path], tmp_path: Path, capsys: p
         assert said in capsys.readouterr().err
 
 
+def test_a_page_without_a_map_to_render_is_refused_and_says_what_to_do(
+    runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (runs[1] / "map.ply").unlink()
+    words = [str(run) for run in runs]
+    assert compare([*words, "--html", str(tmp_path / "page.html")]) == 1
+    said = capsys.readouterr().err
+    assert f"{runs[1]}: map.ply is missing" in said
+    assert "without --html the figures alone are compared" in said
+    assert compare(words) == 0
+
+
 def test_eval_shows_what_the_run_reached(runs: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
     assert evaluate([str(runs[0])]) == 0
     assert capsys.readouterr().out.startswith("held-out    PSNR 30.00 dB, 3 frames")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from mvsgs_core.export.cameras import read_cameras
 from mvsgs_core.kept_map import STREAM, tracker_file
 from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.maps.info import days_of, main
+from mvsgs_core.maps.unfinished import what_is_missing
 from nodes import Node
 from nodes.frozen_mapper import FrozenMapper
 from nodes.localization_file import HEADER
@@ -87,6 +90,34 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("kept") / "first"
     run_inline(compose([*SMALL, "dataset.stop=40", "keep_map=true", f"output={output}"]))
     return output
+
+
+def test_of_an_unfinished_runs_map_it_is_said_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def reported(**content: Any) -> str | None:
+        (tmp_path / "report.json").write_text(json.dumps(content))
+        return what_is_missing(tmp_path)
+
+    def tracked(*keyframes: int) -> None:
+        known = SimpleNamespace(keyframes=[SimpleNamespace(index=index) for index in keyframes])
+        monkeypatch.setattr("mvsgs_core.tracking.known_map.load", lambda file: known)
+
+    frozen(tmp_path)  # of keyframes 0 to 5
+    tracked(*range(8))
+    assert "finish that one, and copy it again" in str(what_is_missing(tmp_path)), "a copy without the report"
+    lacks = (
+        "its run has not reached its end, 6 of the tracker's 8 keyframes have splats; "
+        f"finish it first: mvsgs resume={tmp_path}"
+    )
+    assert reported(finished=False) == lacks
+    for node in (Mapper, FrozenMapper):
+        config = node.Config(map=str(tmp_path), threads=1, device="cpu")
+        assert f"{tmp_path}: {lacks}" in list(node(config).stats.warnings)
+    assert "run it again" in str(reported(finished=False, resume=None))
+    assert reported(finished=False, map="finished") is None, "its report alone is missing"
+    assert reported(finished=True) is None, "keyframes that were refused"
+    (tmp_path / "report.json").unlink()
+    tracked(*range(5))
+    assert what_is_missing(tmp_path) is None, "saved on request"
 
 
 @pytest.mark.slow

@@ -98,6 +98,19 @@ def test_a_map_is_saved_while_it_grows_and_a_new_one_begins_where_it_is_asked(tm
     assert after.iterations > before.iterations, "a new map grows, whatever was asked of the one before"
 
 
+def test_a_new_map_that_was_asked_for_and_got_no_keyframe_says_so_and_where_the_one_before_is(tmp_path: Path) -> None:
+    node = Mapper(settings())
+    list(node.on_fused_keyframe(view_message(0, 0.0)))
+    list(node.on_request(Request(1, "reset", kept=str(tmp_path / "kept"))))
+    list(node.on_end())
+    assert node.stats.values["nothing"] == (
+        f"another map was begun on request (the one before is in {tmp_path / 'kept'}: "
+        f"{int(node.stats.counts['inserted'])} splats, 1 keyframes); since then the mapper made no splat: "
+        "no keyframe with depth came to it"
+    )
+    assert checkpoint_info(tmp_path / "kept").keyframes.tolist() == [0]
+
+
 def test_a_map_in_which_frames_are_only_found_stays_as_it_is() -> None:
     node = Mapper(settings())
     for k in range(2):

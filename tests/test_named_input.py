@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from mcap.writer import Writer
 from launch.compose import choices_of, compose
 from launch.named_input import with_named_input
 from launch.refusal import GraphError
+from launch.run_all import hydra_arguments
 from mvsgs_core.datasets import recognized
 from tests.support.dataset_folders import (
     colmap_text,
@@ -148,6 +150,27 @@ def test_any_name_reaches_the_reader_as_it_is(name: str, tmp_path: Path) -> None
     (tmp_path / name).touch()
     graph = compose(with_named_input([str(tmp_path / name)], CHOICES))
     assert graph.slots["dataset"].config["path"] == str(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "name", ["Küche", "a [1]", "my walk (1)", "a=b", "it's", "a#b", "a;b & c!", "[old", "a, ü", "back\\ä"]
+)
+def test_any_name_of_a_folder_is_taken_as_it_is_or_it_is_said_how_to_write_it(name: str) -> None:
+    for key in ("output", "map", "dataset.path"):
+        word = f"{key}=./{name}" if "old" not in name else f"{key}={name}"
+        try:
+            graph = compose(["dataset=images", word, *([] if key == "output" else ["output=x"])])
+        except GraphError as error:
+            assert name in ("[old", "a, ü"), "may be a list or a sweep"
+            (typed,) = shlex.split(str(error).rpartition("; as a text: ")[2])
+            graph = compose(["dataset=images", typed, *([] if key == "output" else ["output=x"])])
+        config = {"output": graph.settings.output, "map": graph.settings.map} | graph.slots["dataset"].config
+        found = config[key.removeprefix("dataset.")]
+        assert Path(str(found)).name == name
+
+
+def test_the_folder_of_a_sweep_may_have_any_name() -> None:
+    assert "hydra.sweep.dir='./Küche (1)'" in hydra_arguments(["-m", "output=./Küche (1)", "seed=1,2"])
 
 
 HIDDEN = ("gopro/._GX010001.MP4", "gopro/GL010001.LRV", "gopro/GX010001.MP4", "hidden/.DS_Store")

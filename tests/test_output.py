@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
-from launch.compose import compose
-from launch.jobs import _scored
+from launch.compose import compose, graph_of
+from launch.jobs import Job, _in_its_folder, _scored
 from launch.outcome import Outcome
 from launch.output import Output, is_of_a_run, others_files, read_report
+from launch.refusal import GraphError
 from mvsgs_core.trajectory_file import write_trajectory
 
 
@@ -122,6 +124,46 @@ def test_a_cameras_password_is_in_no_report_and_its_settings_are_their_owners(ou
     output.begin(compose([]).resolved, "mvsgs", resumed=False)
     (output.path / "plain").touch()
     assert (output.path / "config.yaml").stat().st_mode == (output.path / "plain").stat().st_mode
+
+
+def test_runs_that_begin_in_the_same_second_get_folders_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def job(output: str | None) -> Job:
+        config = OmegaConf.create(compose([]).resolved | {"output": output})
+        config.mapper.output = "${output}"
+        return Job(config, [], {"dataset": "synthetic"}, None)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("launch.compose.time.strftime", lambda form: "now")
+    folders = []
+    for _ in range(3):
+        one = job(None)
+        graph = _in_its_folder(graph_of(one.config, one.overrides, one.choices), one)
+        folders.append(Path(graph.settings.output))
+        assert graph.slots["mapper"].config["output"] == graph.settings.output, "its stages write there, too"
+    assert folders == [tmp_path / "runs" / name for name in ("now-synthetic", "now-synthetic-2", "now-synthetic-3")]
+    assert all(folder.is_dir() for folder in folders)
+    named = job(str(folders[0]))
+    graph = graph_of(named.config, named.overrides, named.choices)
+    assert _in_its_folder(graph, named) is graph, "a folder that was named is that one"
+
+
+def test_what_killed_processes_left_half_written_goes(output: Output) -> None:
+    (output.path / "checkpoint" / "keyframes").mkdir(parents=True)
+    half = (
+        ".report.17.json", ".map.4.ply", "checkpoint/.tracker.5.npz", "checkpoint/.state-00000002.5.npz",
+        "checkpoint/keyframes/.000003-0a1b2c3d.5.png",
+    )  # fmt: skip
+    others = (".notes.17.json", ".report.json", ".report.old.json", "checkpoint/tracker.npz")
+    for resumed in (True, False):
+        for name in (*half, *others):
+            (output.path / name).touch()
+        output.begin({}, "mvsgs", resumed=resumed)
+        assert [name for name in half if (output.path / name).exists()] == []
+        assert [name for name in others[:3] if not (output.path / name).exists()] == []
+    with pytest.raises(GraphError, match="is writing there"):
+        Output(output.path)  # of a run that is under way: who comes second does not get as far
 
 
 def test_only_the_evaluators_report_is_waited_for(output: Output) -> None:

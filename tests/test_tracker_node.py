@@ -89,6 +89,11 @@ def test_a_request_that_cannot_be_met_changes_nothing_and_says_what_to_do(tmp_pa
         assert "this run only localizes" in problem(localizer, Request(6, asked, on, empty, empty))
     assert not problem(localizer, Request(7, "localize"))
     assert not Path(empty).exists()
+    assert not problem(node, Request(8, "reset", kept=empty))
+    list(node.on_end())
+    assert node.stats.values["nothing"] == (
+        f"no frame came after another map was begun on request; the one before is in {empty}"
+    )
 
 
 def test_what_an_update_corrects_is_known_before_its_keyframes() -> None:

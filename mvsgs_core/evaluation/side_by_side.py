@@ -44,7 +44,7 @@ def page(runs: Sequence[Run], figures: Sequence[Figure]) -> str:
     """The document. Raises ValueError and OSError where a run's map cannot be read."""
     names = [run.name for run in runs]
     commands = {run.name: str((run.report.get("run") or {}).get("command") or run.folder) for run in runs}
-    maps = [(read_ply(run.folder / "map.ply"), read_cameras(run.folder / "cameras.json")) for run in runs]
+    maps = [_map_of(run.folder) for run in runs]
     common = sorted(set.intersection(*(set(cameras.keyframes.tolist()) for _, cameras in maps)))
     scores = [run.by_frame() for run in runs]
     body = [
@@ -69,6 +69,17 @@ def chosen(common: Sequence[int], scores: Sequence[Mapping[int, float]]) -> list
     if scored:
         found.add(max(scored, key=lambda index: float(np.ptp([of_run[index] for of_run in scores]))))
     return sorted(found)
+
+
+def _map_of(folder: Path) -> tuple[Snapshot, Cameras]:
+    """Raises ValueError, saying what to do, where a run left none."""
+    files = folder / "map.ply", folder / "cameras.json"
+    if missing := [file.name for file in files if not file.is_file()]:
+        raise ValueError(
+            f"{folder}: {' and '.join(missing)} is missing, from which keyframes are rendered: the run wrote no map "
+            "(as with mapper=frozen), or it was removed; without --html the figures alone are compared"
+        )
+    return read_ply(files[0]), read_cameras(files[1])
 
 
 def _table(names: Sequence[str], figures: Sequence[Figure]) -> str:

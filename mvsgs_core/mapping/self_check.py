@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -70,19 +70,23 @@ def check(pairs: Iterable[Shown]) -> SelfCheck | None:
     return SelfCheck(*np.median(found, axis=0).tolist()) if found else None
 
 
-def why_nothing(log: Stats) -> str:
-    """Why a map has no splat: what was counted on the way."""
-    views, refused = int(log.counts.get("views", 0)), int(log.counts.get("refused_views", 0))
+def why_nothing(log: Stats, before: Mapping[str, float] | None = None) -> str:
+    """Why a map has no splat: what was counted on the way. before: what had been when it was begun, of another map."""
+
+    def counted(name: str) -> int:
+        return int(log.counts.get(name, 0) - (before or {}).get(name, 0))
+
+    views, refused = counted("views"), counted("refused_views")
     if not views and not refused:
         return "the mapper made no splat: no keyframe with depth came to it"
     if not views:
         return f"the mapper made no splat: all {refused} keyframes were refused ({log.warnings[0]})"
-    blind = int(log.counts.get("views_without_depth", 0))
+    blind = counted("views_without_depth")
     if blind == views:
         return f"the mapper made no splat: none of {views} keyframes had a pixel with depth after the filters"
     return (
         f"the mapper has no splat left: {views} keyframes, {views - blind} of them with depth, gave "
-        f"{int(log.counts.get('inserted', 0))} splats; all of them faded out"
+        f"{counted('inserted')} splats; all of them faded out"
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from mvsgs_core.camera import told_readout_time
 from mvsgs_core.kept_map import FOLDER, TRACKER, check_kept_map, tracker_file
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
+from mvsgs_core.maps.unfinished import what_is_missing
 from mvsgs_core.tracking import known_map
 
 CLOCK = (1e9, 2.0**31)  # s that are a clock's, 2001 to 2038: others count from a file's beginning or in another unit
@@ -50,6 +51,8 @@ def info(output: Path) -> list[str]:
         lines.append(f"taken       {days}")
     if len(known.segments) > 1:
         lines.append(f"parts       {len(known.segments)}, which share no frame of reference")
+    if missing := what_is_missing(output):
+        lines.append(f"unfinished  {missing}")
     size = sum(file.stat().st_size for file in (output / FOLDER).rglob("*") if file.is_file())
     return [*lines, f"size        {1e-6 * size:.1f} MB in {output / FOLDER}"]
 

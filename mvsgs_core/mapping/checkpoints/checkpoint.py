@@ -80,15 +80,6 @@ def load(output: Path, config: MapperConfig, log: Stats, *, counted: bool = True
     raise ValueError("; ".join(problems) or nothing_there(output))
 
 
-def images_of(file: Path) -> set[str]:
-    """Names of the image files that a state refers to; none where it is damaged."""
-    try:
-        mappers = read_state(file)[0].get("mappers")
-        return {name for part in mappers for name in (*part["images"], *part["between"])}  # type: ignore[union-attr]
-    except (ValueError, TypeError, KeyError):
-        return set()
-
-
 def described(config: Any, kind: type[Any] = MapperConfig, prefix: str = "") -> dict[str, str]:
     """All parameters that `kind` declares as text, by name with dots."""
     found: dict[str, str] = {}

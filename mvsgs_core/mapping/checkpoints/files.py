@@ -104,8 +104,35 @@ def read_state(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     return meta, arrays
 
 
+def images_of(file: Path) -> set[str]:
+    """Names of the image files that a state refers to; none where it is damaged."""
+    try:
+        return _images(read_state(file)[0])
+    except ValueError:
+        return set()
+
+
+def _images(meta: Mapping[str, Any]) -> set[str]:
+    try:
+        return {name for part in meta["mappers"] for name in (*part["images"], *part["between"]) if name}
+    except (TypeError, KeyError):
+        return set()
+
+
+def _check_images(file: Path, names: set[str]) -> None:
+    """Raises ValueError where any is not there."""
+    folder = file.parent / KEYFRAMES
+    there = {image.name for image in folder.iterdir()} if folder.is_dir() else set()
+    if missing := sorted(map(str, names - there)):
+        raise ValueError(
+            f"{file} needs {len(names)} images in {folder}, of which {len(missing)} are missing, such as {missing[0]}: "
+            f"copy the whole folder {FOLDER} from where the map was made"
+        )
+
+
 def _info(file: Path) -> CheckpointInfo:
     meta, arrays = read_state(file)
+    _check_images(file, _images(meta))
     keyframes = np.sort(arrays["keyframes"])
     return CheckpointInfo(
         file, meta["newest_view"], meta["stream_seconds"], keyframes, meta["splats"], meta["stream_ended"]

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from mvsgs_core.kept_map import FOLDER
 from mvsgs_core.mapping.atlas import Atlas
-from mvsgs_core.mapping.checkpoints.checkpoint import images_of, save
-from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, number_of, state_file, state_files
+from mvsgs_core.mapping.checkpoints.checkpoint import save
+from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, images_of, number_of, state_file, state_files
 from mvsgs_core.mapping.checkpoints.images import image_name, write_image
 from mvsgs_core.mapping.checkpoints.results import write_results
 from mvsgs_core.mapping.config import MapperConfig

@@ -8,6 +8,7 @@ the configuration as "module:Class".
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
@@ -183,14 +184,31 @@ FLOWS = {
 }
 
 
+def _maker(name: str) -> Callable[..., Flow]:
+    """What makes the flow of a name, see `make_flow`."""
+    module, _, attribute = FLOWS.get(name, name).partition(":")
+    wanted = f"flow={name}: must be one of {', '.join(FLOWS)}, or module:Class"
+    if not (module and attribute):
+        raise ValueError(wanted)
+    try:
+        found: Callable[..., Flow] | None = getattr(import_named(module), attribute, None)
+    except (ImportError, ValueError) as error:
+        raise ValueError(f"{wanted}; {error}") from error
+    if not callable(found):
+        raise ValueError(f"{wanted}; there is no {attribute!r} in {module}")
+    return found
+
+
 def make_flow(name: str, **options: Any) -> Flow:
     """A flow by its name in FLOWS or as "module:Class". Raises ValueError for a name that is neither."""
-    path = FLOWS.get(name, name)
-    module, _, attribute = path.partition(":")
-    if not attribute:
-        raise ValueError(f"no flow {name!r}: give one of {', '.join(FLOWS)}, or module:Class")
-    flow: Flow = getattr(import_named(module), attribute)(**options)
-    return flow
+    return _maker(name)(**options)
+
+
+def check_flow(name: str) -> None:
+    """Raises ValueError as `make_flow` does, and FileNotFoundError where weights are missing; makes none of others."""
+    maker = _maker(name)
+    if name in FLOWS:
+        maker()
 
 
 __all__ = [
@@ -201,6 +219,7 @@ __all__ = [
     "LucasKanade",
     "Matches",
     "RefinedFlow",
+    "check_flow",
     "make_flow",
     "propagate",
     "refined_features",

@@ -205,6 +205,8 @@ def test_an_image_that_is_missing_or_another_is_refused(tmp_path: Path) -> None:
     first.unlink()
     with pytest.raises(ValueError, match="cannot be read"):
         load(tmp_path, PLAIN, Stats())
+    with pytest.raises(ValueError, match=f"1 are missing, such as {first.name}: copy the whole folder"):
+        checkpoint_info(tmp_path)  # what is asked before anything starts
 
 
 def test_other_parameters_are_said_and_refused_where_the_map_depends_on_them(tmp_path: Path) -> None:
