@@ -13,7 +13,9 @@ from launch.refusal import GraphError
 from launch.run_directory import base_directory
 from launch.settings_file import FILES
 from launch.specs import check_addresses
-from nodes.parameters import did_you_mean
+from nodes.parameters import did_you_mean, located
+
+DEVICES = ("auto", "cpu", "cuda", "torch")  # torch: PyTorch on the CPU, in the place of C++
 
 
 def check(graph: Graph) -> None:
@@ -27,7 +29,7 @@ def check(graph: Graph) -> None:
         try:
             slot.node.check(slot.parameters)
         except (OSError, ValueError) as error:
-            raise GraphError(f"{name}: {error}") from error
+            raise GraphError(located(error, slot.node.Config, name)) from error
     if not graph.settings.inline:
         check_addresses(graph)
         base_directory(graph)
@@ -91,7 +93,11 @@ def _ranges(numbers: set[int]) -> str:
 
 def _check_device(slot: str, device: Any) -> None:
     """A GPU that a slot asks for by itself, not by the global `device`, must be there."""
-    if not isinstance(device, str) or not device.startswith("cuda"):
+    if not isinstance(device, str):
+        return
+    if device.partition(":")[0] not in DEVICES:
+        raise GraphError(f"{slot}.device={device}: must be auto, cpu, cuda or cuda:<number>")
+    if not device.startswith("cuda"):
         return
     import torch  # takes a second to load
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, is_dataclass, replace
 from functools import cached_property
+from inspect import get_annotations
 from pathlib import Path
 from typing import Any
 
@@ -181,6 +182,7 @@ def _build_slot(
     name: str, section: Mapping[str, Any], replaced: Replaced | None, settings: Settings, device: GlobalDevice
 ) -> Slot:
     node = load_node(name, str(section["_target_"]))
+    _check_config(name, node)
     inputs, accepted = _handlers(name, node), parameter_names(node.Config)
     reads = dict(section.get("reads") or {})
     given = {key: value for key, value in section.items() if key not in ("_target_", "reads", "implies")}
@@ -208,6 +210,15 @@ def _build_slot(
     if settings.realtime and nodes.is_source(node) and msgs.Frame.__name__ not in placed.best_effort:
         placed = replace(placed, best_effort=[*placed.best_effort, msgs.Frame.__name__])
     return Slot(name, node, parameters, typed, placed)
+
+
+def _check_config(name: str, node: type[nodes.Node]) -> None:
+    """Of a node that somebody else wrote. What inherits from a dataclass passes for one, without its own parameters."""
+    config = node.Config
+    if not is_dataclass(config) or (get_annotations(config) and "__dataclass_fields__" not in vars(config)):
+        frozen = "(frozen=True)" if getattr(getattr(config, "__dataclass_params__", None), "frozen", False) else ""
+        said = f"{node.__module__}.{node.__qualname__}.Config must be a dataclass: write @dataclass{frozen} above it"
+        raise GraphError(f"{name}: {said}")
 
 
 def _completed(name: str, node: type[nodes.Node], config: Any) -> dict[str, Any]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from mvsgs_core.setting_ranges import SEEDS, at_least, within
+
 BUFFER, LIVE_BUFFER = 4, 128  # messages: a live stage works off a burst, and holds nobody up meanwhile
 
 
@@ -39,6 +41,10 @@ class Settings:
     keys: str | None = None  # directory of CURVE keys: without them nothing listens beyond loopback
     screen: Literal["auto", "live", "plain", "off"] = "auto"
     supervise: Supervise = field(default_factory=Supervise)
+
+    def __post_init__(self) -> None:
+        within(self, seed=SEEDS)
+        at_least(self, buffer=1)
 
 
 # nodes that have such a parameter and are given none of their own get these

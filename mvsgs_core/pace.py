@@ -34,6 +34,19 @@ class Effort:
     telling: bool = True  # the time it takes says what the others would
 
 
+def check_share(share: float) -> None:
+    """Raises ValueError for what is no share."""
+    if not 0.0 < share <= 1.0:
+        raise ValueError(f"share={share}: of a core's time, above 0 and at most 1")
+
+
+def check_efforts(efforts: Sequence[Effort], only: Sequence[int] | None) -> None:
+    """Raises ValueError for positions that none of the efforts has, and for none at all; None: all."""
+    if only is not None and not (only and set(only) <= set(range(len(efforts)))):
+        names = ", ".join(f"{k}: {effort.name}" for k, effort in enumerate(efforts))
+        raise ValueError(f"efforts={list(only)}: some of {names}")
+
+
 class Pace:
     """Feeds on keyframes as they come (`came`), and on what they cost (`spend`)."""
 
@@ -45,12 +58,9 @@ class Pace:
         only: positions of the efforts that may be made; None: all. Raises ValueError for none, or others.
         """
         self.efforts, self.share = tuple(efforts), share
+        check_efforts(self.efforts, only)
         self._open = sorted(range(len(self.efforts)) if only is None else set(only))
-        if not self._open or not 0 <= self._open[0] <= self._open[-1] < len(self.efforts):
-            names = ", ".join(f"{k}: {effort.name}" for k, effort in enumerate(self.efforts))
-            raise ValueError(f"efforts={list(only or ())}: some of {names}")
-        if not 0.0 < share <= 1.0:
-            raise ValueError(f"share={share}: of a core's time, above 0 and at most 1")
+        check_share(share)
         self.log = Stats() if log is None else log
         self.waiting: Callable[[], int] = lambda: 0  # keyframes that came and were not taken up
         self._gaps: deque[float] = deque(maxlen=GAPS)  # seconds of the stream between two keyframes
@@ -116,4 +126,4 @@ class Pace:
             self.log.skip(f"effort on keyframes: {effort.name}")
 
 
-__all__ = ["HORIZON", "Effort", "Pace"]
+__all__ = ["HORIZON", "Effort", "Pace", "check_efforts", "check_share"]

@@ -10,6 +10,7 @@ import numpy as np
 from msgs import Depth, Keyframe, Poses, Request, TrackedFrame
 from mvsgs_core import camera
 from mvsgs_core.inverse_depth import enlarge_inverse_depth
+from mvsgs_core.setting_ranges import at_least
 from nodes import Node
 from nodes.mvs import depth_message
 
@@ -20,6 +21,9 @@ class CoarseDepth(Node):
     @dataclass
     class Config:
         area: int = 320 * 240  # pixels of a depth map, aspect kept
+
+        def __post_init__(self) -> None:
+            at_least(self, area=1)
 
     config: Config
 

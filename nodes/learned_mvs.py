@@ -8,6 +8,7 @@ from msgs import Depth
 from mvsgs_core.mvs.cascade import CascadeDepth
 from mvsgs_core.mvs.learned import NOT_FINITE, LearnedStereo, LearnedStereoConfig, check_network
 from mvsgs_core.networks.checkpoints import RANDOM
+from mvsgs_core.pace import check_efforts
 from nodes.mvs import StereoNode
 
 
@@ -22,6 +23,7 @@ class LearnedMvs(StereoNode):
 
     @classmethod
     def check(cls, config: Config) -> None:
+        check_efforts(LearnedStereo.efforts, config.efforts)
         check_network(config.network, config.weights)
 
     def _make_core(self) -> LearnedStereo:

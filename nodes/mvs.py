@@ -10,6 +10,7 @@ import numpy as np
 
 from msgs import Depth, Keyframe
 from mvsgs_core.mvs.cascade import Cascade, CascadeConfig, CascadeDepth, OnlineStereo
+from mvsgs_core.pace import check_efforts
 from nodes.windowed import WindowedNode
 
 
@@ -105,6 +106,10 @@ class Mvs(StereoNode):
         resume_after: int | None = None  # keyframes up to this frame are in a resumed map: neighbors of others only
 
     config: Config
+
+    @classmethod
+    def check(cls, config: Config) -> None:
+        check_efforts(Cascade.efforts, config.efforts)
 
     def _make_core(self) -> Cascade:
         return Cascade(self.config)

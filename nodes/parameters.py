@@ -7,6 +7,7 @@ launcher and the node's process both build it here, so what one takes the other 
 from __future__ import annotations
 
 import difflib
+import math
 import types
 import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -61,8 +62,15 @@ def build(config: type[T], given: Mapping[str, Any], where: str = "", base: T | 
     try:
         return config(**values)
     except ValueError as error:
-        named = not where or str(error).startswith(where)
-        raise ParameterError(str(error) if named else f"{where}: {error}") from error
+        raise ParameterError(located(error, config, where)) from error
+
+
+def located(error: Exception, config: type, where: str) -> str:
+    """What a configuration's error says, with the path of the parameter that it names first (`lag=-1: ...`)."""
+    said = str(error)
+    if not where or said.startswith(where):
+        return said
+    return _path(where, said) if said.partition("=")[0] in parameter_names(config) else f"{where}: {said}"
 
 
 def plain_values(value: Any) -> Any:
@@ -175,8 +183,8 @@ def _scalar(value: Any, kind: type) -> Any:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if issubclass(kind, Enum):
         return kind[value] if isinstance(value, str) and value in kind.__members__ else None
-    if kind is float:
-        return float(value) if is_number else None
+    if kind is float:  # NaN is below, above and equal to nothing: no check would find it
+        return float(value) if is_number and not math.isnan(value) else None
     if kind in (str, Path):
         return kind(str(value)) if is_number or isinstance(value, str | Path) else None
     return value if isinstance(value, kind) and (kind is bool or not isinstance(value, bool)) else None
@@ -203,7 +211,8 @@ def type_name(annotation: Any) -> str:
 
 
 def _wrong_type(value: Any, annotation: Any, where: str) -> ParameterError:
-    return ParameterError(f"{where}={value}: must be {type_name(annotation)}")
+    nan = "not a number, " if isinstance(value, float) and math.isnan(value) else ""
+    return ParameterError(f"{where}={value}: {nan}must be {type_name(annotation)}")
 
 
 def _meant(config: type, where: str, name: str, given: Mapping[str, Any]) -> str:

@@ -11,6 +11,7 @@ from msgs import Frame, GroundTruth, Keyframe, Poses, Request, TrackedFrame, Tra
 from mvsgs_core.tracking.between import Between
 from mvsgs_core.tracking.config import PosedConfig
 from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity
+from mvsgs_core.tracking.matching.flow import check_flow
 from mvsgs_core.tracking.posed import PosedTracker as CoreTracker
 from mvsgs_core.tracking.publish import affine_of, changed_vignetting, differ
 from mvsgs_core.trajectory import velocities
@@ -42,6 +43,10 @@ class PosedTracker(Node):
         self._vignetting: np.ndarray | None = None  # (3,) that was sent
         self._places: dict[int, np.ndarray] = {}  # by GPS
         self._revision = 0
+
+    @classmethod
+    def check(cls, config: Config) -> None:
+        check_flow(config.flow)
 
     def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses | TrackedFrame]:
         self._frames[frame.index] = frame

@@ -13,6 +13,7 @@ from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.preview import preview_arrays
 from mvsgs_core.mapping.provisional import Provisional
+from mvsgs_core.setting_ranges import at_least
 from nodes import Node
 from nodes.mapped_messages import coarse_keyframe
 from nodes.preview_delay import PreviewDelay
@@ -27,6 +28,10 @@ class PreviewConfig(MapperConfig):
 
     preview_period: float = 1.0  # seconds between previews; 0: none
     preview_splats: int = 100000  # at most so many in a preview
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, preview_period=0, preview_splats=1)
 
 
 class Previews:

@@ -14,6 +14,7 @@ import viser
 from msgs import Preview, SplatMap, TrackerPhase
 from mvsgs_core.export.ply import folded
 from mvsgs_core.mapping.preview import gaussian_arrays, thinned
+from mvsgs_core.setting_ranges import at_least
 from nodes import Node
 from nodes.keyframe_pictures import KeyframePictures, depth_points, pictures
 from nodes.map_page import MapPage, check_address, escaped
@@ -45,6 +46,7 @@ class Viewer(Node):
 
     @classmethod
     def check(cls, config: Config) -> None:
+        at_least(config, max_frustums=0, max_splats=1)
         check_address(config.host, config.port)
         check_names(config.names, "names")
 

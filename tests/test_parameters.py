@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import Enum
@@ -77,6 +78,7 @@ def test_plain_values_become_what_the_annotations_say() -> None:
         3, 2.0, None, Path("a/b"), (4, 5), ["u"], (1.0, 2.5), "slow", Color.BLUE, Inner(1.0), (Inner(2.0), Inner()),
         {"any": [1, None]}, {"a": 1.0}, 3, True,
     )  # fmt: skip
+    assert build(Sample.Config, {"required": 1, "ratio": math.inf}).ratio == math.inf
     assert build(Sample.Config, json.loads(json.dumps(plain_values(config)))) == config  # and back
     assert isinstance(config.number, int)
     assert isinstance(config.limits["a"], float)
@@ -103,6 +105,8 @@ def test_plain_values_become_what_the_annotations_say() -> None:
         ({"required": 1, "inner": {"weight": "x"}}, "sample.inner.weight=x: must be float"),
         ({"required": 1, "parts": [{"weight": "x"}]}, "sample.parts[0].weight=x: must be float"),
         ({"required": 1, "limits": {"a": "b"}}, "sample.limits.a=b: must be float"),
+        ({"required": 1, "ratio": float("nan")}, "sample.ratio=nan: not a number, must be float"),
+        ({"required": 1, "many": [1.0, float("nan")]}, "sample.many[1]=nan: not a number, must be float"),
     ],
 )
 def test_what_does_not_fit_is_named(given: dict[str, Any], error: str) -> None:
@@ -118,6 +122,8 @@ class Outer:
     def __post_init__(self) -> None:
         if self.inner.weight < 0:
             raise ValueError("the weight is negative")
+        if self.inner.count < 0:
+            raise ValueError(f"inner={self.inner.count}: must be 0 or more")
 
 
 def test_what_is_given_in_part_keeps_its_parent_s_default_for_the_rest() -> None:
@@ -128,6 +134,8 @@ def test_what_is_given_in_part_keeps_its_parent_s_default_for_the_rest() -> None
 def test_what_a_dataclass_refuses_itself_is_refused_with_its_path() -> None:
     with pytest.raises(ParameterError, match=r"^outer: the weight is negative$"):
         build(Outer, {"inner": {"weight": -1.0}}, "outer")
+    with pytest.raises(ParameterError, match=r"^outer\.inner=-1: must be 0 or more$"):
+        build(Outer, {"inner": {"count": -1}}, "outer")
 
 
 def test_every_parameter_has_a_path_down_to_the_innermost() -> None:
@@ -154,6 +162,15 @@ def test_a_runner_gives_what_the_hook_yields_and_counts_it() -> None:
 def test_a_runner_refuses_what_a_node_did_not_declare() -> None:
     with pytest.raises(TypeError, match="Wrong yields a Frame, but its annotations say Keyframe"):
         list(Runner("wrong", Wrong()).handle(frame()))
+
+
+def test_a_runner_refuses_a_node_that_was_not_made_as_one() -> None:
+    class Unmade(Left):
+        def __init__(self, config: Any = None) -> None:
+            self.config = config
+
+    with pytest.raises(TypeError, match=r"^Unmade\.__init__ must call super\(\).__init__\(config\)"):
+        Runner("left", Unmade())
 
 
 def test_ends_of_a_diamond_are_merged_by_node() -> None:

@@ -82,8 +82,8 @@ class Synthetic:
         film.size = target_size(film.size, SIZE)
         if film.scene not in SCENES:
             raise ValueError(f"synthetic: no scene {film.scene!r}; there are: {', '.join(SCENES)}")
-        if film.frames < 1 or film.stride < 1 or film.start < 0:
-            raise ValueError("synthetic: frames and stride at least 1, start at least 0")
+        if film.frames < 1 or film.stride < 1 or film.start < 0 or film.seed < 0:
+            raise ValueError("synthetic: frames and stride at least 1, start and seed at least 0")
         if film.streets < 2 or film.streets % 2:
             raise ValueError("synthetic: streets must be an even number, so that the outer ones make a ring")
         return film, Difficulties(**{k: v for k, v in options.items() if k in known and v is not None})

@@ -11,6 +11,8 @@ from mvsgs_core.mapping.insertion import InsertionConfig
 from mvsgs_core.mapping.keyframes import ConvergenceConfig
 from mvsgs_core.mapping.losses import Loss, LossWeights
 from mvsgs_core.mapping.optimizer import OptimizerConfig
+from mvsgs_core.pace import check_share
+from mvsgs_core.setting_ranges import SEEDS, at_least, within
 
 ITERATIONS, LIVE = 15, 30  # of a keyframe while the stream runs; in real time, where nothing waits for them
 FEWEST = 16  # keyframes that a refinement is long enough for: a map of fewer has as much to settle
@@ -35,6 +37,9 @@ class TrainingConfig:
     antialiased: bool = False  # for maps that are seen from afar: a splat smaller than a pixel does not grow brighter
     near: float = 1e-3  # splats nearer than this many median depths are left out
     backend: Literal["auto", "reference", "cpu", "triton"] = "auto"  # of the rasterizer
+
+    def __post_init__(self) -> None:
+        at_least(self, pose_rate=0, pose_visits=0, near=0)
 
 
 @dataclass(frozen=True)
@@ -65,6 +70,9 @@ class MapperConfig:
     density_control: DensityControlConfig = field(default_factory=DensityControlConfig)
 
     def __post_init__(self) -> None:
+        at_least(self, iterations=0, refinement=0, max_pixels=1, max_keyframes=1, images_in_memory=0)
+        within(self, sh_degree=(0, 3), seed=SEEDS)
+        check_share(self.share)
         if self.window < 1:
             raise ValueError(f"mapper.window={self.window}: newest keyframes, 1 at least")
 

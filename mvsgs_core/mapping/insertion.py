@@ -16,6 +16,7 @@ from mvsgs_core.mapping.partition import Partition
 from mvsgs_core.rasterizer.kernels import neutral_beta
 from mvsgs_core.rasterizer.spherical_harmonics import from_rgb
 from mvsgs_core.rasterizer.splats import Splats
+from mvsgs_core.setting_ranges import above, at_least, within
 
 MIN_COSINE = 0.25  # between ray and normal: a surface seen more slantingly is not stretched further
 DOUBTFUL = 1e-3  # weight of a pixel of doubtful depth beside one of known depth
@@ -36,6 +37,11 @@ class InsertionConfig:
     initial_scale: float = 0.6  # standard deviation over the side of the rectangle
     flatten: float = 0.3  # thickness along the normal over the smaller width; 1: as thick as that
     initial_opacity: float = 0.5  # 0 to 1 (Stereo-GS: 0.1)
+
+    def __post_init__(self) -> None:
+        at_least(self, price=0, median_errors=0)
+        above(self, initial_scale=0, flatten=0)
+        within(self, min_opacity=(0, 1), doubtful_confidence=(0, 1), initial_opacity=(0, 1))
 
 
 @dataclass(frozen=True)

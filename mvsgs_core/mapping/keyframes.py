@@ -13,6 +13,7 @@ from torch import Tensor
 from mvsgs_core import camera
 from mvsgs_core.geometry import Similarity
 from mvsgs_core.photometry import IDENTITY, compose, inverse
+from mvsgs_core.setting_ranges import at_least, within
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,10 @@ class ConvergenceConfig:
     visits: int = 30  # iterations on a keyframe before it can count as converged
     improvement: float = 0.02  # fraction by which the loss must still fall
     keep: float = 0.5  # fraction of the visits that a converged keyframe still gets
+
+    def __post_init__(self) -> None:
+        at_least(self, visits=0, improvement=0)
+        within(self, keep=(0, 1))
 
 
 @dataclass

@@ -23,6 +23,7 @@ from mvsgs_core.named_modules import import_named
 from mvsgs_core.rasterizer.interface import Render
 from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.rasterizer.ssim import image_loss
+from mvsgs_core.setting_ranges import at_least
 
 LOWERED = 0.2  # scale at which the mask is made
 TINY = 1e-20
@@ -35,6 +36,9 @@ class LossWeights:
     l1: float | None = None  # of the mean absolute error
     ssim: float | None = None  # of 1 - SSIM
     frequency: float | None = None  # of the L1 inside the frequency-modulated mask
+
+    def __post_init__(self) -> None:
+        at_least(self, l1=0, ssim=0, frequency=0)
 
 
 Loss = Literal["ssim", "ges"]

@@ -11,6 +11,7 @@ from torch import Tensor
 from mvsgs_core import native
 from mvsgs_core.mapping.map_state import PARAMETERS, MapState
 from mvsgs_core.rasterizer.interface import Moved, SplatStep
+from mvsgs_core.setting_ranges import at_least, within
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
 
@@ -35,6 +36,8 @@ class OptimizerConfig:
     betas: float = 1.0e-3  # shape exponent a step
 
     def __post_init__(self) -> None:
+        at_least(self, means=0, decay_steps=0, log_scales=0, quaternions=0, opacity_logits=0, sh=0, betas=0)
+        within(self, means_final=(0, 1))
         if not 1e-5 <= self.max_scale <= 1e5:
             raise ValueError(f"mapper.optimizer.max_scale={self.max_scale}: median depths, from 1e-5 to 1e5")
         if not 1e-3 <= self.max_scale_in_stream <= 1.0:

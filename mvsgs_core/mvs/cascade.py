@@ -17,7 +17,8 @@ from mvsgs_core.mvs.hypotheses import RangeConfig, SearchRange, search_range
 from mvsgs_core.mvs.keyframe import StereoKeyframe, prepare_keyframe
 from mvsgs_core.mvs.neighbors import NeighborConfig, select_neighbors
 from mvsgs_core.mvs.stereo import StereoConfig, StereoDepth, empty_depth, estimate_depth
-from mvsgs_core.pace import Effort, Pace
+from mvsgs_core.pace import Effort, Pace, check_share
+from mvsgs_core.setting_ranges import at_least
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,10 @@ class OnlineStereoConfig:
     share: float = 0.75  # of a core's time that stereo may take then
     efforts: tuple[int, ...] | None = None  # those that may be made then, by their place among all; null: all
 
+    def __post_init__(self) -> None:
+        at_least(self, area=1, lag=0, window=0)
+        check_share(self.share)
+
 
 @dataclass(frozen=True)
 class CascadeConfig(StereoConfig, OnlineStereoConfig):
@@ -43,6 +48,10 @@ class CascadeConfig(StereoConfig, OnlineStereoConfig):
     # Whatever a GPU takes over of a keyframe, PyTorch's paths go row by row, in hundreds of thousands of short steps:
     # C++ on two cores needs a tenth of a second.
     device: str = "cpu"  # cpu (C++), cuda or cuda:0 (PyTorch), torch (PyTorch on the CPU), auto (CUDA if there is one)
+
+    def __post_init__(self) -> None:
+        StereoConfig.__post_init__(self)
+        OnlineStereoConfig.__post_init__(self)
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 
 from mvsgs_core import camera
-from mvsgs_core.mvs.interface import TILE, Backend, ChooseOptions, MatchingImages
+from mvsgs_core.mvs.interface import RADII, TILE, Backend, ChooseOptions, MatchingImages
 from mvsgs_core.mvs.matching_cost import CostConfig
 from mvsgs_core.mvs.pruning import tile_counts
+from mvsgs_core.setting_ranges import above, at_least, within
 from mvsgs_core.warp import apply_warp
 
 
@@ -34,6 +35,11 @@ class DepthEdgeConfig:
     p2: float = 1.0  # the most that a change costs
     min_difference: float = 1.0  # pixels: tiles whose candidates differ less keep their depth
     edge: float = 12.0  # gray levels that halve P1 and P2
+
+    def __post_init__(self) -> None:
+        within(self, radius=RADII)
+        at_least(self, p1=0, p2=0, min_difference=0)
+        above(self, edge=0)
 
 
 def continued_surfaces(inverse_depth: np.ndarray, rings: tuple[int, ...]) -> np.ndarray:

@@ -11,6 +11,7 @@ from mvsgs_core import camera
 from mvsgs_core.membrane import membrane
 from mvsgs_core.mvs.interface import SurfaceEstimate
 from mvsgs_core.mvs.keyframe import StereoKeyframe
+from mvsgs_core.setting_ranges import at_least, within
 from mvsgs_core.warp import apply_warp, relative_warp
 
 
@@ -22,6 +23,10 @@ class RangeConfig:
     margin: float = 1.6  # factor beyond these percentiles
     min_cells: int = 24  # fewer valid cells: ask the neighbors' grids
     min_weight: float = 0.05  # a cell below is unknown
+
+    def __post_init__(self) -> None:
+        within(self, percentile=(0, 50))
+        at_least(self, margin=1, min_cells=1, min_weight=0)
 
 
 @dataclass(frozen=True)

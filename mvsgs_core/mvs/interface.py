@@ -8,8 +8,10 @@ from typing import Literal, Protocol
 import numpy as np
 
 from mvsgs_core.mvs.matching_cost import CostConfig
+from mvsgs_core.setting_ranges import above, at_least
 
 TILE = (8, 16)  # (rows, columns) of the tiles that a sweep can leave out
+RADII = (0, 16)  # pixels that the radius of a matching window may have
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,10 @@ class SmoothingConfig:
     break_steps: float = 4.0  # hypotheses: a larger jump of the surface ends the path
     temperature: float = 0.02  # of the softmax, in cost
     paths: Literal[4, 8] = 8  # directions
+
+    def __post_init__(self) -> None:
+        above(self, edge=0, temperature=0)
+        at_least(self, break_steps=0)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from mvsgs_core.mvs.hypotheses import SearchRange
 from mvsgs_core.mvs.keyframe import StereoKeyframe
 from mvsgs_core.mvs.stereo import StereoDepth
 from mvsgs_core.networks import checkpoints, itermvs, mvsformer
+from mvsgs_core.setting_ranges import at_least
 
 NOT_FINITE = "pixels that the network gave no finite depth or confidence"  # in the counts of a StereoDepth
 
@@ -57,6 +58,10 @@ class LearnedStereoConfig(OnlineStereoConfig):
     network: Literal["itermvs", "mvsformer", "mvsformer_p"] = "itermvs"
     weights: str | None = None  # checkpoint; null: where mvsgs_core.weights finds it; random: untrained, for tests
     network_area: int = 512 * 384  # pixels of the images that the network sees, aspect kept
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, network_area=1)
 
 
 def make_network(name: str, file: str | None) -> nn.Module:

@@ -10,6 +10,8 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+from mvsgs_core.setting_ranges import above, at_least, within
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -33,6 +35,9 @@ class CostConfig:
     def __post_init__(self) -> None:
         if not 1e-6 <= self.noise <= 1e6:
             raise ValueError(f"cost.noise={self.noise}: gray levels², from 1e-6 to 1e6")
+        at_least(self, top_k=1)
+        above(self, contrast=0, intensity_range=0)
+        within(self, intensity_weight=(0, 1))
 
 
 class MatchingCost(ABC):

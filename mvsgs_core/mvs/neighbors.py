@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mvsgs_core.mvs.keyframe import StereoKeyframe
+from mvsgs_core.setting_ranges import above, at_least, within
 from mvsgs_core.warp import apply_warp, relative_warp
 
 
@@ -22,6 +23,11 @@ class NeighborConfig:
     min_overlap: float = 0.3  # part of the reference that the neighbor sees
     turn: float = 30.0  # degrees between the optical axes that halve the score
     zoom: float = 0.2  # logarithm of how much larger a point's surroundings are in one of both: the score's width
+
+    def __post_init__(self) -> None:
+        at_least(self, count=1, best_angle=0, min_angle=0)
+        above(self, angle_below=0, angle_above=0, turn=0, zoom=0)
+        within(self, min_overlap=(0, 1))
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import numpy as np
 
 from mvsgs_core.mvs.interface import TILE
 from mvsgs_core.mvs.keyframe import StereoKeyframe
+from mvsgs_core.setting_ranges import at_least, within
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,10 @@ class PruningConfig:
     cell_margin: float = 2.0  # factor beyond these percentiles
     min_cells: int = 8  # with fewer known ones around it, a tile searches the whole range
     min_weight: float = 0.3  # a cell below says nothing
+
+    def __post_init__(self) -> None:
+        at_least(self, cell_radius=0, cell_margin=1, min_cells=1, min_weight=0)
+        within(self, cell_percentile=(0, 50))
 
 
 def tile_counts(size: tuple[int, int]) -> tuple[int, int]:

@@ -10,10 +10,11 @@ import numpy as np
 from mvsgs_core.mvs.confidence import Evidence, probability_of_inlier
 from mvsgs_core.mvs.depth_edges import DepthEdgeConfig, refine_depth_edges
 from mvsgs_core.mvs.hypotheses import SearchRange, certainty, fill_uncertain, upsample_surface
-from mvsgs_core.mvs.interface import Backend, MatchingImages, SmoothingConfig, SurfaceEstimate
+from mvsgs_core.mvs.interface import RADII, Backend, MatchingImages, SmoothingConfig, SurfaceEstimate
 from mvsgs_core.mvs.keyframe import StereoKeyframe
 from mvsgs_core.mvs.matching_cost import CostConfig
 from mvsgs_core.mvs.pruning import PruningConfig, tiles_in_cells
+from mvsgs_core.setting_ranges import above, at_least, within
 from mvsgs_core.warp import parallax, relative_warp
 
 
@@ -27,6 +28,11 @@ class Stage:
     radius: int  # pixels, of the matching window
     p1: float  # cost of a change by one hypothesis between neighboring pixels
     p2: float  # cost of a larger change
+
+    def __post_init__(self) -> None:
+        at_least(self, scale=1, hypotheses=2, p1=0, p2=0)
+        above(self, step=0)
+        within(self, radius=RADII)
 
 
 @dataclass(frozen=True)
@@ -44,6 +50,10 @@ class StereoConfig:
     depth_edges: DepthEdgeConfig | None = field(
         default_factory=DepthEdgeConfig
     )  # choice between the surfaces there; null: none
+
+    def __post_init__(self) -> None:
+        if not self.stages:
+            raise ValueError("stages=[]: must have one stage at least")
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from mvsgs_core.setting_ranges import at_least
+
 
 @dataclass(frozen=True)
 class PhotographsConfig:
@@ -17,6 +19,7 @@ class PhotographsConfig:
     area: int = 320 * 240  # pixels of the grid of 8x8 cells that the points are sent on, as of the other trackers
 
     def __post_init__(self) -> None:
+        at_least(self, area=1)
         if self.features < 100:
             raise ValueError(f"tracker.features={self.features}: of fewer than 100 no photograph gets a pose")
         if self.near < 0:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from mvsgs_core.setting_ranges import at_least
 from mvsgs_core.tracking.back_end import BackEndConfig
 from mvsgs_core.tracking.estimation.focal import FocalConfig
 from mvsgs_core.tracking.estimation.rolling_shutter import check_readout_time
@@ -15,6 +16,8 @@ from mvsgs_core.tracking.places.covisibility import CovisibilityConfig
 from mvsgs_core.tracking.places.loop_closure import LoopConfig
 from mvsgs_core.tracking.places.recovery import RecoveryConfig
 from mvsgs_core.tracking.places.relocalization import RelocalizationConfig
+
+LEAST_AREA = 32 * 32  # pixels: OpenCV's flow between frames takes no image of a few
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,7 @@ class KeyframeTrackingConfig:
     local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
 
     def __post_init__(self) -> None:
+        at_least(self, area=LEAST_AREA)
         if self.frames_between < 0:
             raise ValueError(f"tracker.frames_between={self.frames_between}: a number of frames, 0 for none")
 

@@ -23,9 +23,12 @@ END_BYTES = MAX_END_HEADER_BYTES - MAX_HEADER_BYTES  # the rest is for what a he
 
 
 class Runner:
-    """A node with its hooks by message type. Raises TypeError when it yields what its annotations do not say."""
+    """A node with its hooks by message type. Raises TypeError when it yields what its annotations do not say, and of
+    one that was not made as a Node is."""
 
     def __init__(self, name: str, node: Node) -> None:
+        if not hasattr(node, "stats"):
+            raise TypeError(f"{type(node).__name__}.__init__ must call super().__init__(config), and does not")
         self.name = name
         self.node = node
         self.busy_seconds = 0.0  # inside the node's own code

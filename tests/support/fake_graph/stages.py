@@ -237,3 +237,22 @@ class LateSink(Node):
     def on_end(self) -> None:
         told = {"keyframes": self.keyframes, "relay_cpu": self.upstream["relay"]["cpu_seconds"]}
         Path(self.config.output, "late.json").write_text(json.dumps(told))
+
+
+class Undecorated(Bare):
+    """Its Config is no dataclass."""
+
+    class Config:
+        stride: int = 1
+
+
+@dataclass(frozen=True)
+class Kept:
+    stride: int = 1
+
+
+class Added(Bare):
+    """Its Config inherits from one, and has a parameter that that does not know."""
+
+    class Config(Kept):
+        gain: float = 1.0
