@@ -139,7 +139,7 @@ def velocities(timestamps: np.ndarray, world_from_cam: np.ndarray, known: np.nda
     order = np.flatnonzero(known)
     begins = np.flatnonzero(~repeated(world_from_cam[order]))
     new = order[begins]
-    for k, same in enumerate(np.split(order, begins[1:])):
+    for k, same in enumerate(np.split(order, begins[1:]) if len(order) else ()):
         around = [m for m in new[max(k - 1, 0) : k + 2] if abs(timestamps[m] - timestamps[new[k]]) < LONGEST_GAP]
         seconds = timestamps[around[-1]] - timestamps[around[0]]
         rests = timestamps[same[-1]] - timestamps[same[0]] >= LONGEST_GAP

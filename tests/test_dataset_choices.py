@@ -103,7 +103,7 @@ def test_a_missing_path_is_refused_before_a_process_starts(
     config = OmegaConf.create(compose(given).resolved)
     assert run(Job(config, [], {"dataset": choice}, None)) == 2
     said = capsys.readouterr().err
-    assert said.startswith("error: dataset: ")
+    assert said.startswith(f"error: dataset.path={path}: " if choice == "player" else "error: dataset: ")
     assert "dataset.path" in said if path is None or choice == "player" else f"{path} is missing" in said
     assert not (tmp_path / "out").exists()
 

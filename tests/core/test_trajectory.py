@@ -92,6 +92,10 @@ def test_an_image_that_is_shown_again_moves_as_the_camera_did_when_it_was_taken(
     np.testing.assert_allclose(found, np.tile(15.0 * twist, (len(shown), 1)), atol=1e-9)
 
 
+def test_where_no_pose_is_known_no_velocity_is() -> None:
+    assert not velocities(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)), np.zeros(3, bool)).any()
+
+
 def test_a_camera_that_rests_has_no_velocity() -> None:
     poses = np.tile(np.eye(4), (13, 1, 1))
     poses[:3, 0, 3], poses[10:, 0, 3] = [-3.0, -2.0, -1.0], [1.0, 2.0, 3.0]
