@@ -99,10 +99,14 @@ def test_a_map_is_saved_while_it_grows_and_a_new_one_begins_where_it_is_asked(tm
 
 
 def test_a_new_map_that_was_asked_for_and_got_no_keyframe_says_so_and_where_the_one_before_is(tmp_path: Path) -> None:
-    node = Mapper(settings())
+    out = tmp_path / "out"
+    node = Mapper(settings(output=str(out), checkpoint=0.01))
     list(node.on_fused_keyframe(view_message(0, 0.0)))
+    while not (out / "map.ply").exists():
+        time.sleep(0.01)
     list(node.on_request(Request(1, "reset", kept=str(tmp_path / "kept"))))
     list(node.on_end())
+    assert list(out.iterdir()) == []
     assert node.stats.values["nothing"] == (
         f"another map was begun on request (the one before is in {tmp_path / 'kept'}: "
         f"{int(node.stats.counts['inserted'])} splats, 1 keyframes); since then the mapper made no splat: "

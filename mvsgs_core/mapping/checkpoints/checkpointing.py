@@ -10,7 +10,7 @@ from pathlib import Path
 from mvsgs_core.export.source_camera import SourceCamera
 from mvsgs_core.kept_map import FOLDER
 from mvsgs_core.mapping.atlas import Atlas
-from mvsgs_core.mapping.checkpoints.results import write_results
+from mvsgs_core.mapping.checkpoints.results import remove_results, write_results
 from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.stats import Stats
@@ -97,6 +97,7 @@ class Checkpointing:
         self._pass_problems_on(atlas.current.log)
         if not mapped:
             shutil.rmtree(self._output / FOLDER, ignore_errors=True)
+            remove_results(self._output)
 
     def _due(self, atlas: Atlas) -> bool:
         if self._period <= 0 or self._writer.busy or not any(len(part.state) for part in atlas.parts.values()):

@@ -44,6 +44,12 @@ def write_results(output: Path, mapper: OnlineMapper, *, source: SourceCamera | 
     return (output / "map.ply").stat().st_size
 
 
+def remove_results(output: Path) -> None:
+    """Those of a map that is no more; the map goes first."""
+    for name in ("map.ply", "cameras.json", "transforms.json", "trajectory.txt"):
+        (output / name).unlink(missing_ok=True)
+
+
 def cameras_of(final: Snapshot, views: list[TrainingView]) -> Cameras:
     """The cameras of a map's keyframes, at the size of their images as they came; `views` as in the snapshot."""
     count = len(views)
