@@ -41,6 +41,7 @@ def refusal(*words: str) -> str:
         ("mapper.share=0.0", "of a core's time, above 0 and at most 1"),
         ("mapper.share=nan", "not a number, must be float"),
         ("mapper.device=gpu", "must be auto, cpu, cuda or cuda:<number>"),
+        ("mapper.device=torch", "must be auto, cpu or cuda:<number>"),
         ("mapper.refine.overlap=1.5", "must be from 0 to 1"),
         ("mvs.lag=-1", "must be 0 or more"),
         ("mvs.window=-1", "must be 0 or more"),

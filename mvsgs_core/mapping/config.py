@@ -73,6 +73,8 @@ class MapperConfig:
         at_least(self, iterations=0, refinement=0, max_pixels=1, max_keyframes=1, images_in_memory=0)
         within(self, sh_degree=(0, 3), seed=SEEDS)
         check_share(self.share)
+        if self.device == "torch":
+            raise ValueError("device=torch: the map has no other twin on the CPU, must be auto, cpu or cuda:<number>")
         if self.window < 1:
             raise ValueError(f"mapper.window={self.window}: newest keyframes, 1 at least")
 
