@@ -16,7 +16,13 @@ from mvsgs_core.datasets.lens import Lens, guess_lens
 
 FISHEYE = "fisheye"  # first of the distortion: what follows are the four coefficients of OpenCV's fisheye model
 _NEAR = 0.1  # of half of a side, from the middle: there the principal point is of nearly all cameras
+_SAME = 0.03  # of a side, by which the middle of images of a size is off
 _SEEN = 0.9  # of half of a side, from the middle: there it is of all pictures that were not cropped
+_USUAL = (  # width, height of images: principal points in the middle of another one than ours are of that
+    (320, 240), (640, 360), (640, 480), (752, 480), (800, 600), (848, 480), (960, 540), (1024, 768), (1280, 720),
+    (1280, 800), (1280, 960), (1280, 1024), (1440, 1080), (1600, 1200), (1920, 1080), (1920, 1200), (1920, 1440),
+    (2048, 1536), (2560, 1440), (2592, 1944), (2688, 1512), (3264, 2448), (3840, 2160), (4000, 3000), (4032, 3024),
+)  # fmt: skip
 
 
 def lens_from_option(
@@ -71,13 +77,18 @@ def size_doubt(lens: Lens) -> list[str]:
             f"{width}x{height}: if the two were exchanged, or the camera was turned after its calibration, give "
             f"dataset.intrinsics=[{fx:g},{fy:g},{cy:g},{cx:g}]{turned}"
         ]
-    if off <= _SEEN:
-        return []
-    such = f" (about {2 * cx + 1:.0f}x{2 * cy + 1:.0f})" if min(cx, cy) > 0 else ""
-    return [
-        f"the principal point cx, cy = {cx:g}, {cy:g} lies at the border of images of {width}x{height} or outside: "
-        f"unless they were cropped, the intrinsics are those of another size{such} and must be scaled to theirs"
-    ]
+    theirs = 2 * cx + 1, 2 * cy + 1
+    such = f" (about {theirs[0]:.0f}x{theirs[1]:.0f})" if min(cx, cy) > 0 else ""
+    cropped = f"unless they were cropped, the intrinsics are those of another size{such} and must be scaled to theirs"
+    if off > _SEEN:
+        where = f"lies at the border of images of {width}x{height} or outside"
+        return [f"the principal point cx, cy = {cx:g}, {cy:g} {where}: {cropped}"]
+    usual = any(abs(theirs[0] - w) <= _SAME * w and abs(theirs[1] - h) <= _SAME * h for w, h in _USUAL)
+    if off > 2 * _NEAR and (usual or abs(theirs[0] / width - theirs[1] / height) <= _SAME):
+        return [
+            f"the principal point cx, cy = {cx:g}, {cy:g} is not in the middle of images of {width}x{height}: {cropped}"
+        ]
+    return []
 
 
 def _off_middle(lens: Lens, size: tuple[int, int]) -> float:

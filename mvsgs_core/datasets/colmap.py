@@ -31,13 +31,17 @@ _PARAMETERS = dict(_MODELS)
 
 def find_colmap(folder: Path) -> Path | None:
     """The folder with the model below `folder`, where COLMAP users keep it."""
-    for name in FOLDERS:
-        candidate = folder / name
-        if any(
-            (candidate / f"cameras{s}").is_file() and (candidate / f"images{s}").is_file() for s in (".bin", ".txt")
-        ):
-            return candidate
-    return None
+    return next((folder / name for name in FOLDERS if _has_model(folder / name)), None)
+
+
+def models_beside(model: Path) -> list[Path]:
+    """Of sparse/0: sparse/1, sparse/2, ... with the images that COLMAP could not join with its own."""
+    others = model.parent.iterdir() if model.name == "0" else ()
+    return sorted(other for other in others if other.name.isdecimal() and other != model and _has_model(other))
+
+
+def _has_model(folder: Path) -> bool:
+    return any((folder / f"cameras{s}").is_file() and (folder / f"images{s}").is_file() for s in (".bin", ".txt"))
 
 
 def read_colmap(folder: Path) -> Model:

@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import BinaryIO
 
@@ -214,8 +215,12 @@ def natural_order(name: str) -> list[tuple[int, int | str]]:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """Image files directly in `folder`, in natural order, without masks and depth maps beside them."""
-    return sorted((p for p in folder.iterdir() if is_image(p)), key=lambda p: natural_order(p.name))
+    """Image files directly in `folder`, in natural order, without masks and depth maps beside them; those that are all
+    named by a time, as 1700000000.5.jpg, in the order of these."""
+    images = [p for p in folder.iterdir() if is_image(p)]
+    if all(re.fullmatch(r"\d+\.\d+", p.stem, re.ASCII) for p in images):
+        return sorted(images, key=lambda p: (Decimal(p.stem), p.name))
+    return sorted(images, key=lambda p: natural_order(p.name))
 
 
 def is_image(path: Path) -> bool:

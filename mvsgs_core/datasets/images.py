@@ -14,7 +14,7 @@ import numpy as np
 from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets import dataset
 from mvsgs_core.datasets.calibration import exif_notices, image_size, lens_from_option, with_distortion
-from mvsgs_core.datasets.colmap import find_colmap, read_colmap
+from mvsgs_core.datasets.colmap import find_colmap, models_beside, read_colmap
 from mvsgs_core.datasets.exif import exif_doubt, read_exif_exposure, read_exif_lens, read_exif_place, read_exif_time
 from mvsgs_core.datasets.files import (
     IMAGE_SUFFIXES,
@@ -83,7 +83,9 @@ class Images(ImageSequence):
         folder = LAYOUT.folder(self.path)
         images = _find_images(folder, self.warnings)
         sizes = _Sizes.of(images)
-        model = None if self.intrinsics is not None else _find_model(folder, images, self.model, sizes.taken)
+        model = (
+            None if self.intrinsics is not None else _find_model(folder, images, self.model, sizes.taken, self.warnings)
+        )
         mask = None if self.mask is None else Path(self.mask).expanduser()
         one = mask is not None and mask.is_file()
         masks = [mask] * len(images) if one else masks_of(images, folder, mask)
@@ -224,10 +226,26 @@ def _find_images(folder: Path, notes: list[str]) -> list[Path]:
         left = [] if place == folder else [p for p in _below(folder) if not p.is_relative_to(place)]
     if not images:
         raise LAYOUT.missing(f"{folder} has no image")
+    images = _once_each(images, notes)
     if left:
         names = f"{len(left)} (first: {left[0].relative_to(folder).as_posix()})"
         notes.append(f"the images are those {where} {place}; others in {folder} that are not read: {names}")
     return images
+
+
+def _once_each(images: list[Path], notes: list[str]) -> list[Path]:
+    """Without the copies of pictures that were converted: NAME.png beside NAME.jpg."""
+    suffixes = Counter(image.suffix for image in images)
+    first = max(suffixes, key=lambda suffix: (suffixes[suffix], suffix.lower() != ".png"))
+    kept = {image.with_suffix("") for image in images if image.suffix == first}
+    copies = [image for image in images if image.suffix != first and image.with_suffix("") in kept]
+    if len(copies) < 2:  # no habit: they may be two pictures
+        return images
+    notes.append(
+        f"images that are there as {first}, too, and are left out: {len(copies)} (first: {copies[0].name}); if they "
+        "are other pictures, put them into a folder of their own"
+    )
+    return [image for image in images if image not in set(copies)]
 
 
 def _below(place: Path) -> list[Path]:
@@ -311,7 +329,9 @@ def _of_other_shape(sizes: dict[Path, tuple[int, int]]) -> list[Path]:
     return [path for path, size in sizes.items() if not same_shape(size, first)]
 
 
-def _find_model(folder: Path, images: list[Path], given: str | Path | None, size: tuple[int, int]) -> Model | None:
+def _find_model(
+    folder: Path, images: list[Path], given: str | Path | None, size: tuple[int, int], notes: list[str]
+) -> Model | None:
     """size: (height, width) of the images on disk, for a model that does not say it."""
     place = folder if given is None else Path(given).expanduser()
     if given is not None and not place.exists():
@@ -322,7 +342,7 @@ def _find_model(folder: Path, images: list[Path], given: str | Path | None, size
         transforms = base if base.is_file() else find_transforms(base, place.name)
         colmap = find_colmap(base)
         if colmap is not None:
-            return read_colmap(colmap)
+            return read_colmap(colmap) if colmap == base else _largest(colmap, notes)
         if transforms is not None:
             return read_transforms(transforms, size)
         strecha = find_strecha(base)
@@ -337,6 +357,21 @@ def _find_model(folder: Path, images: list[Path], given: str | Path | None, size
     if given is not None:
         raise ValueError(f"model {place} is neither a COLMAP model, nor a {NAMES[0]}, nor a folder of .camera files")
     return None
+
+
+def _largest(first: Path, notes: list[str]) -> Model:
+    """Of the COLMAP models that lie beside the first one, the one with most images, which need not be the first."""
+    models = {first: read_colmap(first)}
+    for other in models_beside(first):
+        with suppress(BadFileError):
+            models[other] = read_colmap(other)
+    best = max(models, key=lambda model: len(models[model].shots))
+    if len(models) > 1:
+        notes.append(
+            f"of {len(models)} COLMAP models in {first.parent}, which share no frame of reference, {best.name} is "
+            f"taken, as it knows most images: {len(models[best].shots)}; dataset.options.model=FOLDER takes another"
+        )
+    return models[best]
 
 
 def _around(image: Path) -> list[Path]:
