@@ -217,7 +217,8 @@ class Mapper(Node):
         self._report()
         self._check()
         if self._checkpoints is not None and len(self.atlas.current.state):
-            self.stats.values["map_bytes"] = self._checkpoints.finish(self.atlas, source_camera(self.upstream))
+            source = source_camera(self.upstream)
+            self.stats.values["map_bytes"] = self._checkpoints.finish(self.atlas, source, self.rest)
         yield from self._previews.of(self.atlas, due=True)  # who watches is left with the map as it is now
         yield splat_map(self.atlas.current.snapshot(), refined=True)
         if self._checkpoints is not None:

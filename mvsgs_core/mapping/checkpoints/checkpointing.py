@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +18,8 @@ from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.stats import Stats
 
 MAX_FRACTION = 0.02  # of the mapper's time, at most, that copying the map for checkpoints holds it up
+PATIENCE, BETWEEN = 60.0, 1.0  # seconds that a full disk is waited for at the end, and between two attempts
+FULL = (errno.ENOSPC, errno.EDQUOT)  # a disk, or what a user may have of it
 LAST = 2.5  # seconds for the last checkpoint of a run that ends early
 
 
@@ -76,14 +80,37 @@ class Checkpointing:
             log.refuse("checkpoints", 1, f"no last checkpoint: {error}")
         self._pass_problems_on(log)
 
-    def finish(self, atlas: Atlas, source: SourceCamera | None = None) -> int:
-        """The finished map: its files are whole and on the disk then; the bytes of map.ply. Raises OSError.
+    def finish(self, atlas: Atlas, source: SourceCamera | None = None, rest: Callable[[], object] = lambda: None) -> int:
+        """The finished map: its files are whole and on the disk then; the bytes of map.ply.
 
-        source: the camera that took the stream.
+        A disk that is full is waited for, `PATIENCE` seconds; then the map goes to a folder for temporary files.
+        source: the camera that took the stream. rest: called while it waits. Raises OSError, which says where the map
+        is.
         """
         self._writer.wait()
-        self._pass_problems_on(atlas.current.log)
-        return write_results(self._output, atlas.current, source=source)
+        log = atlas.current.log
+        self._pass_problems_on(log)
+        until = self._clock() + PATIENCE
+        while True:
+            try:
+                return write_results(self._output, atlas.current, source=source)
+            except OSError as error:
+                if error.errno not in FULL or self._clock() >= until:
+                    raise OSError(self._elsewhere(atlas, source, error)) from error
+                log.warn(f"the finished map finds no room in {self._output}: {error.strerror}; make room there")
+            rest()
+            time.sleep(BETWEEN)
+
+    def _elsewhere(self, atlas: Atlas, source: SourceCamera | None, error: OSError) -> str:
+        """Writes the finished map to a folder for temporary files; what to say."""
+        said = f"the finished map cannot be written to {self._output}: {error.strerror or error}"
+        folder = Path(tempfile.mkdtemp(prefix="mvsgs-map-"))
+        try:
+            write_results(folder, atlas.current, source=source)
+        except OSError as other:
+            shutil.rmtree(folder, ignore_errors=True)
+            return f"{said}; nor to {folder.parent}: {other.strerror or other}"
+        return f"{said}; it is in {folder}"
 
     def close(self, atlas: Atlas, *, keep: bool) -> None:
         """After `finish`. keep: the map's checkpoint is made too, and stays alone; else the last one stays, for a run

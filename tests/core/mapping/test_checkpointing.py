@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import tempfile
 import time
 import weakref
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,12 +19,15 @@ from mvsgs_core.export.cameras import read_source_camera
 from mvsgs_core.export.ply import read_ply
 from mvsgs_core.export.source_camera import GIVEN, SourceCamera
 from mvsgs_core.mapping.atlas import Atlas
+from mvsgs_core.mapping.checkpoints import checkpointing
 from mvsgs_core.mapping.checkpoints.checkpointing import MAX_FRACTION, Checkpointing
 from mvsgs_core.mapping.checkpoints.files import FOLDER, checkpoint_info, state_files
+from mvsgs_core.mapping.checkpoints.results import write_results
 from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mapping.resting_images import rest
 from mvsgs_core.trajectory_file import read_trajectory
+from nodes.runtime.explained import is_explained
 from tests.support.full_disk import full_after
 from tests.support.patience import LONG
 from tests.support.small_atlas import PLAIN, begun, view
@@ -147,6 +153,43 @@ def test_a_final_map_that_cannot_be_written_is_an_error_and_leaves_the_one_befor
         checkpoints.finish(atlas)
     assert (tmp_path / "map.ply").read_bytes() == before
     assert checkpoint_info(tmp_path).splats == len(atlas.largest.state)
+
+
+class FullDisk:
+    """Has no room in a folder, for so many attempts."""
+
+    def __init__(self, folder: Path, attempts: float) -> None:
+        self.folder, self.attempts = folder, attempts
+
+    def __call__(self, output: Path, *given: Any, **named: Any) -> int:
+        if output == self.folder and self.attempts > 0:
+            self.attempts -= 1
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write_results(output, *given, **named)
+
+
+def test_the_finished_map_waits_for_room_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    atlas, rests = begun(PLAIN), []
+    monkeypatch.setattr(checkpointing, "write_results", FullDisk(tmp_path, 3))
+    monkeypatch.setattr(checkpointing, "BETWEEN", 0.0)
+    size = Checkpointing(tmp_path, 0.0, atlas, clock=Clock(1.0)).finish(atlas, rest=lambda: rests.append(1))
+    assert size == (tmp_path / "map.ply").stat().st_size
+    assert len(rests) == 3
+    assert any(f"finds no room in {tmp_path}: No space left" in text for text in atlas.current.log.warnings)
+
+
+def test_a_finished_map_that_finds_no_room_is_put_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    atlas, other = begun(PLAIN), tmp_path / "other"
+    other.mkdir()
+    monkeypatch.setattr(checkpointing, "write_results", FullDisk(tmp_path, np.inf))
+    monkeypatch.setattr(checkpointing, "BETWEEN", 0.0)
+    monkeypatch.setattr(tempfile, "tempdir", str(other))
+    with pytest.raises(OSError, match=f"cannot be written to {tmp_path}: No space left on device; it is in") as raised:
+        Checkpointing(tmp_path, 0.0, atlas, clock=Clock(1.0)).finish(atlas)
+    (folder,) = other.iterdir()
+    assert str(raised.value).endswith(str(folder))
+    assert is_explained(raised.value), "in its message alone"
+    assert len(read_ply(folder / "map.ply").splats) == len(atlas.current.state)
 
 
 def test_the_last_checkpoint_of_a_run_that_ends_early_is_there_at_once(tmp_path: Path) -> None:
