@@ -1,10 +1,26 @@
-"""What was measured at other times than an image's: the nearest, and poses between two."""
+"""Times of images: whether they ascend, and what was measured at other times, the nearest, and poses between two."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
 from mvsgs_core.geometry import interpolate
+
+
+def standstill(frames: Sequence[tuple[float, str]]) -> list[str]:
+    """A warning of frames (seconds, name), in the order of the stream, whose times do not ascend."""
+    late = [there for here, there in pairwise(frames) if there[0] <= here[0]]
+    if not late:
+        return []
+    return [
+        f"frames whose time is not after that of the frame before: {len(late)} (first: {late[0][1]}, "
+        f"{late[0][0]:.6f} s); they are taken in the order of their list, and how fast the camera moves there is not "
+        "known, so that a rolling shutter is left as it is: give each frame its own time, or their folder as "
+        "dataset=images with dataset.options.rate"
+    ]
 
 
 def nearest(wanted: np.ndarray, available: np.ndarray, max_difference: float) -> dict[int, int]:

@@ -20,6 +20,8 @@ import numpy as np
 
 from mvsgs_core import geodesy
 from mvsgs_core.bad_file import BadFileError, reading
+from mvsgs_core.georeference import FEWEST
+from mvsgs_core.stream_times import LATEST
 
 MAX_BYTES = 2**26
 MAX_GAP = 5.0  # seconds between two places, over which nothing is interpolated
@@ -53,6 +55,13 @@ class GpsTrack:
         """Whether its times are since 1970, and not since the stream's beginning."""
         return len(self.seconds) > 0 and float(self.seconds[0]) > CLOCK
 
+    @property
+    def misses(self) -> str:
+        """What to say where no frame's name or time is in it."""
+        if not self.named:
+            return "neither their names nor their times are in it"
+        return f"it names {self.named[0][0]!r}; give it the names of the images, or of a video's frames the times"
+
     def places_by_name(self, frames: Sequence[Path]) -> tuple[dict[Path, np.ndarray], list[Path]]:
         """Places of the frames that are named, and frames that have none because their names are of several.
 
@@ -84,32 +93,69 @@ class GpsTrack:
                 unsure += best_frames
         return places, unsure
 
-    def places_of(self, start: float | None) -> Callable[[float], np.ndarray | None]:
-        """Place of a frame from its timestamp, asked once in the order of the stream.
 
-        start: when timestamp 0 was, seconds since 1970; None: not known.
-        """
-        shift = start or 0.0
-        longitude = np.unwrap(self.places[:, 1], period=360.0)
-        changed = np.ones(len(self.seconds), bool)  # a receiver's fix is repeated until the next one
-        changed[1:] = (self.places[1:] != self.places[:-1]).any(axis=1)
-        fix = np.cumsum(changed)
-        last = -1
+class PlacesInTime:
+    """Places of a stream's frames by their timestamps, each asked once, in the order of the stream."""
 
-        def place(timestamp: float) -> np.ndarray | None:
-            nonlocal last
-            now = timestamp + shift
-            after = int(np.searchsorted(self.seconds, now))
-            before = int(np.searchsorted(self.seconds, now, side="right")) - 1
-            if before < 0 or after >= len(self.seconds) or fix[before] == last:
-                return None
-            if self.seconds[after] - self.seconds[before] > MAX_GAP:
-                return None
-            last = int(fix[before])
-            columns = (self.places[:, 0], longitude, self.places[:, 2])
-            return np.array([np.interp(now, self.seconds, column) for column in columns])
+    def __init__(self, track: GpsTrack, start: float | None) -> None:
+        """start: when timestamp 0 was, seconds since 1970; None: not known."""
+        self._track, self._start = track, start
+        self._longitude = np.unwrap(track.places[:, 1], period=360.0)
+        changed = np.ones(len(track.seconds), bool)  # a receiver's fix is repeated until the next one
+        changed[1:] = (track.places[1:] != track.places[:-1]).any(axis=1)
+        self._fix = np.cumsum(changed)
+        self._last_fix = -1
+        self._frames = self._within = self._placed = 0  # frames, those within the file's times, those with a place
+        self._first, self._last = np.inf, -np.inf  # of the frames' times, as the file counts them
 
-        return place
+    def place(self, timestamp: float) -> np.ndarray | None:
+        """(3,), None where there is none, or none that is new."""
+        seconds, places = self._track.seconds, self._track.places
+        now = timestamp + (self._start or 0.0)
+        self._frames, self._first, self._last = self._frames + 1, min(self._first, now), max(self._last, now)
+        after = int(np.searchsorted(seconds, now))
+        before = int(np.searchsorted(seconds, now, side="right")) - 1
+        if before < 0 or after >= len(seconds):
+            return None
+        self._within += 1
+        if self._fix[before] == self._last_fix:
+            return None
+        if seconds[after] - seconds[before] > MAX_GAP:
+            return None
+        self._last_fix = int(self._fix[before])
+        self._placed += 1
+        return np.array([np.interp(now, seconds, column) for column in (places[:, 0], self._longitude, places[:, 2])])
+
+    def doubt(self) -> str:
+        """What of the times left most frames without a place, and what to do; empty where they do not."""
+        seconds = self._track.seconds
+        remedy = self._remedy() if len(seconds) and self._frames else ""
+        unnamed = " that it does not name" if self._track.named else ""
+        return remedy and (
+            f"a place for {self._placed} of {self._frames} frames{unnamed}: its times are {_told(seconds[0])} to "
+            f"{_told(seconds[-1])}, the frames' {_told(self._first)} to {_told(self._last)}; {remedy}"
+        )
+
+    def _remedy(self) -> str:
+        seconds, clock = self._track.seconds, self._track.on_a_clock
+        if 2 * self._within < self._frames:
+            if clock and self._start is not None:
+                return "is it another time zone? dataset.gps_start says when the first frame was, with its zone"
+            if clock or self._first > CLOCK:
+                return "is it another clock, or time zone? Write them by the clock of the frames"
+            return "is it another unit, or beginning? Write them in seconds from the first frame"
+        begin = max(int(np.searchsorted(seconds, self._first, side="right")) - 1, 0)
+        apart = np.diff(seconds[begin : int(np.searchsorted(seconds, self._last)) + 1])
+        if self._placed < FEWEST and len(apart) and np.median(apart) > MAX_GAP:
+            told = f"between two that are {np.median(apart):.6g} s apart, over {MAX_GAP:g} s, nothing is interpolated: "
+            return told + ("record more of them" if clock else "are they milliseconds? Write them in seconds")
+        return "" if self._placed else "the frames are in a gap of them: record places without one"
+
+
+def _told(seconds: float) -> str:
+    if not CLOCK < seconds < LATEST:
+        return f"{seconds:.6g} s"
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
 
 
 def _common_end(one: str, other: str) -> int:
@@ -240,4 +286,4 @@ _PARSERS: dict[str, Callable[[str], Iterator[_Entry]]] = {
     ".csv": _csv, ".tsv": _csv, ".txt": _csv, ".gpx": _gpx, ".srt": _srt,
 }  # fmt: skip
 
-__all__ = ["CLOCK", "GpsTrack", "clock_time", "read_gps"]
+__all__ = ["CLOCK", "GpsTrack", "PlacesInTime", "clock_time", "read_gps"]

@@ -12,10 +12,11 @@ import numpy as np
 
 from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.datasets import Item
+from mvsgs_core.datasets.by_time import standstill
 from mvsgs_core.datasets.calibration import lens_for_images, with_distortion
 from mvsgs_core.datasets.files import UnreadableImageError, dark_16_bit, read_depth, read_image
 from mvsgs_core.datasets.framing import Framing, same_shape
-from mvsgs_core.datasets.gps import CLOCK, clock_time, read_gps
+from mvsgs_core.datasets.gps import CLOCK, PlacesInTime, clock_time, read_gps
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.masks import CameraMask, masks_of, read_alpha, read_mask
 from mvsgs_core.datasets.options import FileOptions
@@ -80,7 +81,7 @@ class FileReader(FileOptions):
         self.warnings: list[str] = Notices()
         self._notices: Notices = self.warnings  # the same list, with its counting
         self.warnings += [] if self._gps is None else self._gps.warnings
-        self._places: Callable[[float], np.ndarray | None] | None = None
+        self._places: PlacesInTime | None = None
         self._placed = 0  # frames with a place of the file
 
     def _place(self, timestamp: float, began: Callable[[], str | None] | None = None) -> np.ndarray | None:
@@ -92,8 +93,8 @@ class FileReader(FileOptions):
         if self._gps is None:
             return None
         if self._places is None:
-            self._places = self._gps.places_of(self._start_of_clock(timestamp, began))
-        place = self._places(timestamp)
+            self._places = PlacesInTime(self._gps, self._start_of_clock(timestamp, began))
+        place = self._places.place(timestamp)
         self._placed += place is not None
         return place
 
@@ -118,8 +119,10 @@ class FileReader(FileOptions):
 
     def _end_places(self) -> None:
         """To be called when the frames have ended."""
-        if self._gps is not None and not self._placed:
-            self.warnings.append(f"no frame has a place in {self.gps}: neither their names nor their times are in it")
+        if self._places is not None and (doubt := self._places.doubt()):
+            self.warnings.append(f"{self.gps} has {doubt}")
+        elif self._gps is not None and not self._placed:
+            self.warnings.append(f"no frame has a place in {self.gps}: {self._gps.misses}")
         self._places, self._placed = None, 0  # of a second pass
 
     def _check_distortion(self, lens: Lens) -> None:
@@ -175,6 +178,7 @@ class ImageSequence(FileReader, ABC):
                 "12 bits), with ImageMagick in their folder: mkdir bright; mogrify -path bright -evaluate multiply 16 "
                 f"*{sample[0].suffix}"
             )
+        self.warnings += standstill([(record.timestamp, record.image.name) for record in self.records])
         self._named: dict[Path, np.ndarray] = {}
         self._find_named_places()
         self._opening_warnings = len(self.warnings)

@@ -106,7 +106,10 @@ class Tum(ImageSequence):
 
 
 def _read_list(folder: Path, path: Path) -> list[tuple[float, Path]]:
-    """Times and files of the lines of `path`, sorted by time. Raises BadFileError for one that is none."""
+    """Times and files of the lines of `path`, by time, where that is equal as they come.
+
+    Raises BadFileError for a line that is none.
+    """
     entries = []
     for line in path.read_text(encoding="utf-8-sig", errors="replace").splitlines():
         parts = line.split()
@@ -116,7 +119,7 @@ def _read_list(folder: Path, path: Path) -> list[tuple[float, Path]]:
                 if not abs(time) < LATEST:
                     raise ValueError(f"{time} s is no time")
             entries.append((time, inside(folder, parts[1], path)))
-    return sorted(entries)
+    return sorted(entries, key=lambda entry: entry[0])
 
 
 def _named(folder: Path) -> str | None:

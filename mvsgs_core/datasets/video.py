@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
@@ -60,7 +61,7 @@ class Video(FileReader):
     null is refused.
     Frames of another shape than the first are left out and counted, those of another size scaled to it. Video turned by
     its metadata is upright, and HDR is brought to the range of a photograph, what is brighter than white clipped (both
-    by FFmpeg in OpenCV).
+    by FFmpeg in OpenCV). Video that its metadata mirrors is so too, as players show it, with a warning.
     Raises FileNotFoundError and ValueError, which say what was expected, BadFileError for a file that has no frame.
     """
 
@@ -83,7 +84,8 @@ class Video(FileReader):
         with reading(self._path, "cannot be decoded"):
             read, frame = capture.read()
         count, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
-        stretch = _stretch(capture)
+        stretch, mirrors = _stretch(capture), _is_mirrored(self._path)
+        self._flip = (1 if _is_on_its_side(capture) else 0) if mirrors else None  # as cv2.flip has it
         capture.release()
         if not read:
             raise BadFileError(f"{self._path} opens but has no frame: it is damaged, or no video")
@@ -102,6 +104,11 @@ class Video(FileReader):
         self._count = int(count) if 0 < count < _MAX_COUNT else 0
         self._rate = rate if math.isfinite(rate) and 0 < rate < 1000 else _DEFAULT_RATE
         self.warnings += notes + self._framing.notice(self._native) + _range_notice(self._path)
+        if mirrors:
+            self.warnings.append(
+                f"{self._path.name} is mirrored by its metadata, and mapped as players show it: where writing in it is "
+                "shown the wrong way round, so is the map; ffmpeg -i FILE -vf hflip out.mp4 mirrors it back"
+            )
         if self._count and self.start >= self._count:
             raise ValueError(f"no frame left: {self._path.name} has {self._count}, wanted from {self.start}")
         if self._rate != rate:
@@ -160,6 +167,8 @@ class Video(FileReader):
             decoded, frame = capture.retrieve()
             if not decoded:
                 raise ValueError("the decoder gave no picture")
+            if self._flip is not None:
+                frame = cv2.flip(frame, self._flip)
             native = frame.shape[0], frame.shape[1]
             if not same_shape(native, self._native):
                 raise ValueError(f"{native[1]}x{native[0]} after {self._native[1]}x{self._native[0]}")
@@ -212,8 +221,25 @@ def _stretch(capture: cv2.VideoCapture) -> tuple[float, float]:
     """What height and width of an upright frame are multiplied by when it is shown, as the container says."""
     wide, high = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
     aspect = wide / high if wide > 0 and high > 0 else 1.0  # 0: not said
-    turned = capture.get(cv2.CAP_PROP_ORIENTATION_META) % 180 == 90
-    return (aspect, 1.0) if turned else (1.0, aspect)
+    return (aspect, 1.0) if _is_on_its_side(capture) else (1.0, aspect)
+
+
+def _is_on_its_side(capture: cv2.VideoCapture) -> bool:
+    """Whether its metadata turns it by a quarter."""
+    return bool(capture.get(cv2.CAP_PROP_ORIENTATION_META) % 180 == 90)
+
+
+def _is_mirrored(path: Path) -> bool:
+    """Whether its metadata mirrors it. OpenCV turns such a frame so that its rows run as they are shown, and leaves
+    its columns the wrong way round. OpenCV judges a video that does not open."""
+    try:
+        with av.open(str(path)) as container:
+            frame = next(iter(container.decode(container.streams.video[0])))
+            of_frame: Any = frame.side_data  # PyAV's own types know of motion vectors alone
+            shown = np.frombuffer(bytes(of_frame["DISPLAYMATRIX"]), np.int32).reshape(3, 3)
+    except (av.FFmpegError, IndexError, KeyError, OSError, StopIteration, ValueError):
+        return False
+    return bool(np.linalg.det(shown[:2, :2]) < 0.0)
 
 
 def _sharpness(frame: np.ndarray) -> float:

@@ -136,9 +136,53 @@ def test_a_clocks_times_need_the_streams_beginning(tmp_path: Path) -> None:
     np.testing.assert_allclose(found[0], [47.5, 180.0, 0.5])  # over the 180th meridian
     sequence = open_dataset("images", path=tmp_path / "photos", gps=gpx, gps_start="2026-05-01T18:00:00Z")
     assert [item.place for item in sequence] == [None, None, None]
-    assert f"no frame has a place in {gpx}: neither their names nor their times are in it" in sequence.warnings
+    assert (
+        f"{gpx} has a place for 0 of 3 frames: its times are 2026-05-01T12:00:00Z to 2026-05-01T12:00:01Z, the frames' "
+        "2026-05-01T18:00:00Z to 2026-05-01T18:00:00Z; is it another time zone? dataset.gps_start says when the first "
+        "frame was, with its zone"
+    ) in sequence.warnings
     with pytest.raises(BadFileError, match=r"dataset.gps_start has no time of ISO 8601"):
         places(tmp_path / "photos", gps=gpx, gps_start="yesterday")
+
+
+@pytest.mark.parametrize(
+    ("table", "doubt"),
+    [
+        (
+            "time,lat,lon,alt\n" + "".join(f"{33000 * n},47.{n},8,0\n" for n in range(3)),  # of milliseconds
+            "a place for 1 of 8 frames: its times are 0 s to 66000 s, the frames' 0 s to 7 s; between two that are "
+            "33000 s apart, over 5 s, nothing is interpolated: are they milliseconds? Write them in seconds",
+        ),
+        (
+            "time,lat,lon,alt\n" + "".join(f"{100 + n},47.{n},8,0\n" for n in range(9)),
+            "a place for 0 of 8 frames: its times are 100 s to 108 s, the frames' 0 s to 7 s; is it another unit, or "
+            "beginning? Write them in seconds from the first frame",
+        ),
+        (
+            "time,lat,lon,alt\n" + "".join(f"{5 + n},47.{n},8,0\n" for n in range(9)),
+            "a place for 3 of 8 frames: its times are 5 s to 13 s, the frames' 0 s to 7 s; is it another unit, or "
+            "beginning? Write them in seconds from the first frame",
+        ),
+        ("time,lat,lon,alt\n" + "".join(f"{n},47.{n},8,0\n" for n in range(9)), None),
+        ("time,lat,lon,alt\n" + "".join(f"{n},47,8,0\n" for n in range(9)), None),  # a receiver that stands still
+    ],
+)
+def test_times_that_place_few_frames_are_said_beside_the_frames(table: str, doubt: str | None, tmp_path: Path) -> None:
+    write_photos(tmp_path / "photos", 8)
+    (tmp_path / "gps.csv").write_text(table)
+    sequence = open_dataset("images", path=tmp_path / "photos", gps=tmp_path / "gps.csv", rate=1.0, intrinsics="auto")
+    for _ in range(2):
+        list(sequence)
+        said = [warning for warning in sequence.warnings if str(tmp_path / "gps.csv") in warning]
+        assert said == ([] if doubt is None else [f"{tmp_path / 'gps.csv'} has {doubt}"])
+
+
+def test_names_that_are_of_no_frame_are_said(tmp_path: Path) -> None:
+    write_photos(tmp_path / "photos", 2)
+    (tmp_path / "gps.csv").write_text("frame,lat,lon,alt\n0,47,8,0\n1,47.1,8,0\n")
+    sequence = open_dataset("images", path=tmp_path / "photos", gps=tmp_path / "gps.csv")
+    list(sequence)
+    assert any("no frame has a place in" in w and "it names '0'; give it the names" in w for w in sequence.warnings)
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,15 @@ def test_frames_poses_and_depth_are_associated(tmp_path: Path) -> None:
     assert sequence.warnings == ["frames without a depth map, where depth is not scored: 2 (first: 1.png)"]
 
 
+def test_times_that_do_not_ascend_are_said(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "fr3", 12)
+    (folder / "rgb.txt").write_text("".join(f"1.0 rgb/{i}.png\n" for i in range(12)))
+    sequence = open_dataset("tum", path=folder)
+    assert [item.image[0, 0, 0] for item in sequence] == list(range(20, 32)), "in the order of the list"
+    told = "frames whose time is not after that of the frame before: 11 (first: 1.png, 1.000000 s); they are taken in "
+    assert any(warning.startswith(told) for warning in sequence.warnings)
+
+
 def test_selection(tmp_path: Path) -> None:
     sequence = open_dataset("tum", path=write_tum(tmp_path / "fr3", 9), start=1, stop=8, stride=3)
     assert len(sequence) == 3

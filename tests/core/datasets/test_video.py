@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import struct
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 
@@ -197,6 +199,38 @@ def test_a_video_turned_by_its_metadata_is_upright(tmp_path: Path) -> None:
     image = next(iter(open_dataset("video", path=path, intrinsics=[80, 80, 31.5, 47.5]))).image
     assert image.shape == (96, 64, 3)
     assert image[60:, :, 0].min() > 200 > 60 > image[:36, :, 0].max(), "what was left is below"
+
+
+@pytest.mark.parametrize(
+    ("matrix", "shown"),  # where a step to the right goes, and one down
+    [
+        ((-1, 0, 0, 1), lambda picture: picture[:, ::-1]),
+        ((1, 0, 0, -1), lambda picture: picture[::-1]),
+        ((0, 1, 1, 0), lambda picture: picture.transpose(1, 0, 2)),
+        ((0, -1, -1, 0), lambda picture: picture[::-1, ::-1].transpose(1, 0, 2)),
+    ],
+)
+def test_a_video_mirrored_by_its_metadata_is_as_players_show_it(
+    matrix: tuple[int, ...], shown: Callable[[np.ndarray], np.ndarray], tmp_path: Path
+) -> None:
+    path = tmp_path / "phone.mp4"
+    picture = np.zeros((64, 96, 3), np.uint8)
+    picture[:32, :48], picture[:32, 48:], picture[32:, :48] = 80, 160, 240  # no two quarters alike
+    with av.open(path, "w") as container:
+        stream = container.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode())
+    content = bytearray(path.read_bytes())
+    a, b, c, d = (value << 16 for value in matrix)
+    begin = content.index(b"tkhd") + 44  # of the matrix, ISO/IEC 14496-12
+    content[begin : begin + 36] = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    path.write_bytes(content)
+    sequence = open_dataset("video", path=path, intrinsics="auto")
+    assert any("mirrored by its metadata" in warning for warning in sequence.warnings)
+    for item in sequence:
+        assert np.mean(np.abs(item.image.astype(int) - shown(picture))) < 4
 
 
 @pytest.mark.parametrize("turned", [False, True])
