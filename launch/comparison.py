@@ -9,6 +9,7 @@ from typing import Any
 
 from launch.output import REPORT, read_report
 from mvsgs_core.evaluation import metrics
+from mvsgs_core.evaluation.common_frames import different, keyframe_times
 from mvsgs_core.evaluation.metrics import Figure
 
 PARTS = {  # where it is in the report -> how it is called
@@ -64,13 +65,15 @@ def comparison_page(outputs: Sequence[Path]) -> str:
 
 
 def comparison_text(outputs: Sequence[Path]) -> str:
-    """The table for a terminal. Raises ValueError as `compared` does."""
+    """The table for a terminal, and whether its figures compare. Raises ValueError as `compared` does, and OSError."""
     rows = compared(outputs)
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = []
     for row in rows:
         cells = [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:]))]
         lines.append("  ".join(cells).rstrip())
+    said = different([finished_report(output) for output in outputs], [keyframe_times(output) for output in outputs])
+    lines += [f"warning: {said}"] if said else []
     return "\n".join(lines)
 
 

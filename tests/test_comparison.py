@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +18,13 @@ from launch.comparison import compared, comparison_text, names
 from mvsgs.compare import main as compare
 from mvsgs.evaluate import main as evaluate
 from mvsgs_core.evaluation import metrics
+from mvsgs_core.evaluation.common_frames import different, seconds_of
 from mvsgs_core.evaluation.metrics import Figure
 from mvsgs_core.evaluation.side_by_side import chosen
+from mvsgs_core.export.cameras import read_cameras, write_cameras
 from mvsgs_core.export.keyframe_images import write_image
 from tests.support.chromium import browser
-from tests.support.tiny_map import SIZE, write_tiny_run
+from tests.support.tiny_map import INTRINSICS, SIZE, write_tiny_run
 
 
 def scored(folder: Path, psnr: float, splats: int, **more: Any) -> Path:
@@ -79,6 +83,90 @@ def test_the_page_has_the_same_keyframes_of_all_runs(
     assert '<td class="better">31.25 (+1.25)</td>' in page
     assert "http:" not in page
     assert "https:" not in page
+
+
+def begun_later(run: Path, keyframes: int, **more: Any) -> None:
+    """Makes of a tiny run one whose dataset.start left out so many of its keyframes: indices count from there."""
+    cameras = read_cameras(run / "cameras.json").chosen(slice(keyframes, None))
+    write_cameras(run / "cameras.json", replace(cameras, keyframes=cameras.keyframes - cameras.keyframes[0], **more))
+
+
+def with_report(run: Path, /, **more: Any) -> None:
+    (run / "report.json").write_text(json.dumps(json.loads((run / "report.json").read_text()) | more))
+
+
+def test_keyframes_are_the_same_by_their_time_and_not_by_their_index(
+    runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a, b = runs
+    begun_later(b, 1)
+    for run, first in ((a, 30.0), (b, 20.0)):
+        frames = [{"index": 7 * k, "psnr": first + k} for k in range(3)]
+        with_report(run, rendering={"held_out": {"psnr": first, "count": 3}, "frames": frames})
+    assert compare([*map(str, runs), "--html", str(tmp_path / "page.html")]) == 0
+    said = "these runs are of different frames: their figures do not compare; give runs of the same input with the same"
+    assert f"warning: {said}" in capsys.readouterr().out
+    page = (tmp_path / "page.html").read_text()
+    assert f'<p class="warning">{said}' in page
+    assert 'class="better"' not in page
+    assert 'class="worse"' not in page
+    assert re.findall(r'<p class="row">([^<]*)', page) == [
+        "keyframe 7 of a, 0 of b: PSNR a: 31.00 dB, b: 20.00 dB",
+        "keyframe 14 of a, 7 of b: PSNR a: 32.00 dB, b: 21.00 dB",
+    ]
+    lines = [re.findall(r"([\d.]+),", line) for line in re.findall(r'polyline points="([^"]*)"', page)]
+    np.testing.assert_allclose([float(x) for x in lines[1][:2]], [float(x) for x in lines[0][1:]])  # b's begins later
+
+
+def test_runs_of_other_inputs_or_sizes_are_said_to_be_so(
+    runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for run in runs:
+        with_report(run, input="images walk", run={"frame_size": [24, 32]}, trajectory={"frames": 15})
+    words = [*map(str, runs), "--html", str(tmp_path / "page.html")]
+    for more, said, common in (
+        ({}, "", True),
+        ({"run": {"frame_size": [48, 64]}}, "different frame sizes:", True),
+        ({"run": {"frame_size": [24, 32]}, "trajectory": {"frames": 30}}, "different frames:", True),
+        ({"input": "images garden", "run": {"frame_size": [48, 64]}}, "different inputs and frame sizes:", False),
+    ):
+        with_report(runs[1], **more)
+        assert compare(words) == 0
+        shown, page = capsys.readouterr().out, (tmp_path / "page.html").read_text()
+        assert said in shown
+        assert said in page
+        assert ("do not compare" in shown) == ("do not compare" in page) == bool(said)
+        assert ('class="better"' in page) == (not said)
+        assert ("These runs have no keyframe in common." not in page) == common
+
+
+def test_the_error_is_against_a_photograph_of_the_same_size(runs: list[Path], tmp_path: Path) -> None:
+    a, b = runs
+    begun_later(b, 0, sizes=np.full((3, 2), (48, 64)), intrinsics=np.tile(2.0 * INTRINSICS, (3, 1)))
+    words = [*map(str, runs), "--html", str(tmp_path / "page.html")]
+
+    def pictures() -> list[str]:
+        assert compare(words) == 0
+        shown = (tmp_path / "page.html").read_text().split("keyframe 7<")[1].split('<p class="row">')[0]
+        return re.findall('alt="([^"]*)"', shown)
+
+    assert pictures() == ["a", "b", "b, of another size than a"]
+    write_image(a / "keyframes", 7, np.full((*SIZE, 3), 200, np.uint8))
+    assert pictures() == ["photograph", "a", "b", "a, error (x4)", "b, no photograph of its size was kept"]
+    write_image(b / "keyframes", 7, np.full((48, 64, 3), 200, np.uint8))
+    assert pictures() == ["photograph", "a", "b", "a, error (x4)", "b, error (x4)"]
+
+
+def test_streams_differ_where_indices_and_times_do_not_go_together() -> None:
+    def apart(a: dict[int, float], b: dict[int, float]) -> bool:
+        return bool(different([{}, {}], [a, b]))
+
+    whole = {0: 0.0, 4: 0.4, 9: 0.9}
+    assert not apart(whole, {0: 0.0, 3: 0.3, 9: 0.9})  # other keyframes of the same frames
+    assert not apart(whole, {})  # of which nothing is known
+    assert apart(whole, {0: 3.0, 4: 3.4})  # start
+    assert apart(whole, {0: 0.0, 2: 0.4, 5: 1.0})  # stride
+    np.testing.assert_allclose(seconds_of(np.array([0, 2, 9, 11]), whole), [0.0, 0.2, 0.9, 1.1])
 
 
 def test_the_keyframe_in_which_runs_differ_most_is_among_those_shown() -> None:

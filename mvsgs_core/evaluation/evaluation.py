@@ -21,6 +21,7 @@ from mvsgs_core.evaluation.many_frames import each
 from mvsgs_core.evaluation.straight import undistortion
 from mvsgs_core.evaluation.trajectory_metrics import AlignedPath, known_poses
 from mvsgs_core.export.keyframe_render import NEAR, near_plane
+from mvsgs_core.export.ply import ply_size
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.trajectory import TrackingState, Trajectory, velocities
 
@@ -48,6 +49,7 @@ class Evaluation:
     def __post_init__(self) -> None:
         self._frames = Frames(self.folder, self.max_frames, self.max_bytes)
         self._received: set[int] = set()  # frames
+        self._with_depth: set[int] = set()  # keyframes whose filtered depth came
         self.size: tuple[int, int] | None = None  # height, width of the first frame
         self._truth: dict[int, np.ndarray] = {}
 
@@ -79,6 +81,7 @@ class Evaluation:
         mask: np.ndarray | None = None,
     ) -> None:  # fmt: skip
         """A keyframe as it is mapped, with its filtered depth, computed at the map's scale `scale`."""
+        self._with_depth.add(index)
         if mask is None or mask.any():
             self._frames.add_keyframe(index, image, intrinsics, depth, scale, mask)
 
@@ -103,7 +106,7 @@ class Evaluation:
             "frames_on_disk": {"bytes": self._frames.size},
             "map": {
                 "splats": len(final.splats.means) if final else 0,
-                "bytes": sum(tensor.nbytes for tensor in final.splats.tensors().values()) if final else 0,
+                "bytes": ply_size(final) if final else 0,
                 "iterations": final.iterations if final else 0,
                 "kernel": final.kernel if final else None,
             },
@@ -346,6 +349,11 @@ class Evaluation:
         ratios = [depth_ratios(depth, truth) for depth, truth in maps()]
         count = sum(len(ratio) > 0 for ratio in ratios)
         known = np.concatenate(ratios) if ratios else np.empty(0)
+        if missing := self._depths_that_never_came():
+            notes.append(
+                f"depth is scored of {count} of {count + missing} keyframes: that of the others did not come, as where "
+                "they were in a resumed run's map already: for all of them, run it again from the start"
+            )
         if not len(known):
             if self.max_frames:
                 notes.append("no depth error: no keyframe has both filtered and true depth")
@@ -354,6 +362,11 @@ class Evaluation:
         total = sum((score_depth(depth, truth, scale) for depth, truth in maps()), NO_DEPTH)
         ratio = scale / alignment.scale if alignment and alignment.scale > 0.0 else None
         return {**metrics.of_all(metrics.DEPTH, total), "scale_ratio": ratio, "count": count}
+
+    def _depths_that_never_came(self) -> int:
+        """Keyframes of the map whose true depth is there."""
+        others = self._received.intersection(self.keyframes.tolist()) - self._with_depth
+        return sum(self._frames.true_depth(index) is not None for index in others)
 
     def close(self) -> None:
         self._frames.close()

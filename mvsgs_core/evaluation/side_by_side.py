@@ -12,6 +12,7 @@ import numpy as np
 
 from mvsgs_core.camera import resize_image
 from mvsgs_core.evaluation import html, metrics, svg
+from mvsgs_core.evaluation.common_frames import Times, different, one_input, same_keyframes, seconds_of, times_of
 from mvsgs_core.evaluation.metrics import Figure
 from mvsgs_core.evaluation.scoring import colorize
 from mvsgs_core.export import keyframe_images
@@ -45,19 +46,24 @@ def page(runs: Sequence[Run], figures: Sequence[Figure]) -> str:
     names = [run.name for run in runs]
     commands = {run.name: str((run.report.get("run") or {}).get("command") or run.folder) for run in runs}
     maps = [_map_of(run.folder) for run in runs]
-    common = sorted(set.intersection(*(set(cameras.keyframes.tolist()) for _, cameras in maps)))
+    reports = [run.report for run in runs]
+    times = [times_of(cameras) for _, cameras in maps]
+    shared, said = same_keyframes(reports, times), different(reports, times)
+    common = sorted(shared[0])
     scores = [run.by_frame() for run in runs]
+    of_common = [{i: found[k] for i, k in same.items() if k in found} for same, found in zip(shared, scores)]
     body = [
         f"<h1>{len(runs)} runs side by side</h1>",
         f'<div class="run">{html.figures_table(commands)}</div>',
+        *([f'<p class="warning">{escape(said)}</p>'] if said else []),
         f"<h2>Figures, and what they are more than those of {escape(names[0])}</h2>",
-        _table(names, figures),
-        *_plots(runs, scores),
+        _table(names, figures, colored=not said),
+        *_plots(runs, scores, times),
         "<h2>The same keyframes</h2>",
         *([] if common else ["<p>These runs have no keyframe in common.</p>"]),
     ]
-    for index in chosen(common, scores):
-        body += _rows(runs, maps, scores, index)
+    for index in chosen(common, of_common):
+        body += _rows(runs, maps, scores, [same[index] for same in shared])
     return html.document(f"Comparison of {', '.join(names)}", body)
 
 
@@ -82,46 +88,65 @@ def _map_of(folder: Path) -> tuple[Snapshot, Cameras]:
     return read_ply(files[0]), read_cameras(files[1])
 
 
-def _table(names: Sequence[str], figures: Sequence[Figure]) -> str:
+def _table(names: Sequence[str], figures: Sequence[Figure], *, colored: bool) -> str:
     head = "".join(f"<th>{escape(cell)}</th>" for cell in ("", *names))
     rows = []
     for figure in figures:
-        classes = ({True: ' class="better"', False: ' class="worse"', None: ""}[found] for found in figure.better())
+        better = figure.better() if colored else [None] * len(names)
+        classes = ({True: ' class="better"', False: ' class="worse"', None: ""}[found] for found in better)
         cells = "".join(f"<td{word}>{escape(cell)}</td>" for cell, word in zip(figure.cells(), classes))
         rows.append(f"<tr><td>{escape(figure.name)}</td>{cells}</tr>")
     return f'<table class="runs"><tr>{head}</tr>{"".join(rows)}</table>'
 
 
-def _plots(runs: Sequence[Run], scores: Sequence[Mapping[int, float]]) -> list[str]:
-    first = metrics.IMAGE[0]
-    series = [
-        svg.Series(run.name, np.array(sorted(found), dtype=float), np.array([found[index] for index in sorted(found)]))
-        for run, found in zip(runs, scores)
-        if found
-    ]
+def _plots(runs: Sequence[Run], scores: Sequence[Mapping[int, float]], times: Sequence[Times]) -> list[str]:
+    """By time, where it is known of all."""
+    first, timed = metrics.IMAGE[0], all(len(of_run) > 1 for of_run in times)
+    starts = [min(of_run.values(), default=0.0) for of_run in times]
+    starts = [min(starts)] * len(runs) if one_input([run.report for run in runs]) else starts
+    series = []
+    for run, found, of_run, start in zip(runs, scores, times, starts):
+        if found:
+            x = np.array(sorted(found), dtype=float)
+            y = np.array([found[index] for index in sorted(found)])
+            series.append(svg.Series(run.name, seconds_of(x, of_run) - start if timed else x, y))
     if not series:
         return []
-    drawn = svg.plot(series, "frame", first.unit, width=480, height=300)
-    return ["<h2>Along the stream</h2>", f'<div style="max-width: 640px"><b>{first.label} by frame</b>{drawn}</div>']
+    drawn = svg.plot(series, "seconds of the stream" if timed else "frame", first.unit, width=480, height=300)
+    return [f'<h2>Along the stream</h2><div style="max-width: 640px"><b>{first.label} of each frame</b>{drawn}</div>']
 
 
 def _rows(
-    runs: Sequence[Run], maps: Sequence[tuple[Snapshot, Cameras]], scores: Sequence[Mapping[int, float]], index: int
-) -> list[str]:
-    """Renders of one keyframe, and below each its error, or where no run kept the photograph its difference from the
-    first."""
+    runs: Sequence[Run], maps: Sequence[tuple[Snapshot, Cameras]], scores: Sequence[Mapping[int, float]],
+    indices: Sequence[int],
+) -> list[str]:  # fmt: skip
+    """Renders of one keyframe, whose index each run has, and below each its error, or where no run kept the photograph
+    its difference from the first. A run with other sizes has its own photograph, or no error."""
     first = metrics.IMAGE[0]
-    renders = {run.name: render(final, cameras, index) for run, (final, cameras) in zip(runs, maps)}
-    said = [f"{run.name}: {first.text(found[index])}" for run, found in zip(runs, scores) if index in found]
-    caption = f"keyframe {index}" + (f": {first.label} {', '.join(said)}" if said else "")
-    kept = (keyframe_images.known_image(run.folder / keyframe_images.FOLDER, index) for run in runs)
-    photograph = next((image for image in kept if image is not None), None)
-    against = next(iter(renders.values())) if photograph is None else photograph
-    word = f"difference from {runs[0].name}" if photograph is None else "error"
-    errors = {f"{name}, {word} (x{_ERROR})": _error(picture, against) for name, picture in renders.items()}
-    if photograph is None:
-        errors.pop(next(iter(errors)))
-    shown = renders if photograph is None else {"photograph": photograph, **renders}
+    renders = [render(final, cameras, index) for (final, cameras), index in zip(maps, indices)]
+    said = [f"{run.name}: {first.text(of[index])}" for run, of, index in zip(runs, scores, indices) if index in of]
+    which = f"keyframe {indices[0]}"
+    if len(set(indices)) > 1:
+        which = f"keyframe {', '.join(f'{index} of {run.name}' for run, index in zip(runs, indices))}"
+    caption = which + (f": {first.label} {', '.join(said)}" if said else "")
+    kept = [keyframe_images.known_image(run.folder / keyframe_images.FOLDER, k) for run, k in zip(runs, indices)]
+    photographs = [image for image in kept if image is not None]
+    word, lacking = "error", "no photograph of its size was kept"
+    if not photographs:
+        word, lacking = f"difference from {runs[0].name}", f"of another size than {runs[0].name}"
+    errors = {}
+    for run, picture, own in zip(runs, renders, kept):
+        known = [image for image in (own, *(photographs or renders[:1])) if image is not None]
+        against = next((image for image in known if image.shape == picture.shape), None)
+        if against is None:
+            errors[f"{run.name}, {lacking}"] = np.full_like(picture, 128)
+        else:
+            errors[f"{run.name}, {word} (x{_ERROR})"] = _error(picture, against)
+    shown = {run.name: picture for run, picture in zip(runs, renders)}
+    if photographs:
+        shown = {"photograph": photographs[0], **shown}
+    else:
+        errors.pop(next(iter(errors)))  # the first's difference from itself
     above = html.Row(caption, _small(shown), columns=len(shown))
     below = html.Row("", _small(errors), columns=len(shown), empty=1)  # each error below its render
     return [html.row(above), html.row(below)]
@@ -129,8 +154,6 @@ def _rows(
 
 def _error(picture: np.ndarray, against: np.ndarray) -> np.ndarray:
     """Of pictures (H, W, 3) uint8, the mean over the colors, as a report shows it."""
-    if picture.shape != against.shape:
-        against = resize_image(against, (picture.shape[0], picture.shape[1]))
     error = np.abs(picture.astype(np.float32) - against.astype(np.float32)).mean(axis=2) / 255.0
     return colorize(np.clip(_ERROR * error, 0.0, 1.0))
 

@@ -11,7 +11,10 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -97,8 +100,6 @@ def transforms(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
 
 
 def cameras(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
-    if out.name != "cameras.json":
-        return transforms(out, final, options)
     found, beside = posed_cameras(options), options.cameras or options.map.with_name("cameras.json")
     write_cameras(out, found, read_source_camera(beside) if beside.is_file() else None)
     return f"{len(found)} cameras"
@@ -116,10 +117,36 @@ def trajectory(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
     return f"{len(found) - left_out} poses{said}"
 
 
-FORMATS = {  # by the suffix of OUT, of which a folder has none: writes the map, returns what is in the file
-    ".ply": splats, ".splat": splats, ".spz": splats, ".glb": mesh, ".obj": mesh, ".stl": mesh, ".off": mesh,
-    ".json": cameras, ".txt": trajectory, "": colmap,
+class Format(NamedTuple):
+    name: str
+    write: Callable[[Path, Snapshot, argparse.Namespace], str]  # returns what is in the file
+    reads: tuple[str, ...]  # of the options that not all formats read
+
+
+_POSED = ("cameras", "size", "intrinsics", "trajectory", "every")
+MESH = Format("a mesh", mesh, (*_POSED, "antialiased", "voxel"))
+TRANSFORMS = Format("transforms.json", transforms, (*_POSED, "images"))
+FORMATS = {  # by the suffix of OUT, of which a folder has none
+    ".ply": Format("a .ply of splats", splats, ("antialiased", "fold")),
+    ".splat": Format(".splat", splats, ("antialiased",)), ".spz": Format(".spz", splats, ("antialiased",)),
+    ".glb": MESH, ".obj": MESH, ".stl": MESH, ".off": MESH,
+    ".json": Format("cameras.json", cameras, _POSED), ".txt": Format("a trajectory", trajectory, _POSED),
+    "": Format("a COLMAP model", colmap, (*_POSED, "antialiased", "images", "observations")),
 }  # fmt: skip
+
+
+def _format(out: Path, options: argparse.Namespace, unset: Callable[[str], object]) -> Format:
+    """Raises ValueError where there is none of that name, or it does not read an option that was given."""
+    named = TRANSFORMS if out.suffix == ".json" and out.name != "cameras.json" else FORMATS.get(out.suffix)
+    wanted = MESH if options.mesh else named
+    if wanted is None:
+        raise ValueError(f"no format {out.suffix!r}; there are: {', '.join(filter(None, FORMATS))}, a folder")
+    known = list(dict.fromkeys([*FORMATS.values(), TRANSFORMS]))
+    for option in dict.fromkeys(name for each in known for name in each.reads):
+        if option not in wanted.reads and getattr(options, option) != unset(option):
+            readers = ", ".join(each.name for each in known if option in each.reads)
+            raise ValueError(f"--{option} is not for {wanted.name}: leave it out; it is for {readers}")
+    return wanted
 
 
 def _check_not_read(out: Path, options: argparse.Namespace) -> None:
@@ -132,16 +159,17 @@ def _check_not_read(out: Path, options: argparse.Namespace) -> None:
             raise ValueError(f"{out} is read for this export, which would replace it: give another file")
 
 
-def export(options: argparse.Namespace) -> str:
-    """Does what the command line asks; returns one line that says what was written. Raises ValueError, OSError."""
+def export(options: argparse.Namespace, unset: Callable[[str], object]) -> str:
+    """Does what the command line asks; returns one line that says what was written. Raises ValueError, OSError.
+
+    unset: the value of an option that was not given.
+    """
     if not (math.isfinite(options.scale) and options.scale > 0):
         raise ValueError("--scale must be positive")
     if not (math.isfinite(options.voxel) and options.voxel > 0):
         raise ValueError("--voxel must be positive")
     out: Path = options.out
-    write = mesh if options.mesh else FORMATS.get(out.suffix)
-    if write is None:
-        raise ValueError(f"no format {out.suffix!r}; there are: {', '.join(filter(None, FORMATS))}, a folder")
+    write = _format(out, options, unset).write
     _check_not_read(out, options)
     out = out.resolve() if out.is_symlink() else out  # what it leads to is replaced, and not the link
     final, left_out = read_map(options)
@@ -175,7 +203,7 @@ def main(arguments: list[str] | None = None, prog: str = "python -m mvsgs_core.e
         "--frame", choices=("map", "enu"), default="map",
         help="enu: metres east, north and up, where the run had GPS; OUT.origin.json says of which place",
     )  # fmt: skip
-    return run(parser, arguments, export)
+    return run(parser, arguments, partial(export, unset=parser.get_default))
 
 
 if __name__ == "__main__":

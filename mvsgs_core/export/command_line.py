@@ -66,17 +66,24 @@ def sound_map(file: Path, drop_unsound: bool, antialiased: bool | None, dropping
     """The map, and what is to be said of splats that were left out because a value of theirs is not finite, or nothing.
 
     antialiased: None: as the file says. dropping: how a user asks for `drop_unsound`. Raises ValueError where there are
-    such splats and nobody did, FileNotFoundError.
+    such splats and nobody did, or nothing is left, FileNotFoundError.
     """
     if not file.is_file():
         raise FileNotFoundError(f"{file} is missing: a map is a map.ply, or the output folder of a run")
     final = read_ply(file)
     splats = final.splats
+    if not len(splats):
+        raise ValueError(f"{file} has no splats, and so nothing to show or to write: give a map that has some")
     sound = torch.ones(len(splats), dtype=torch.bool)
     for value in splats.tensors().values():
         sound &= torch.isfinite(value).reshape(len(splats), -1).all(dim=1)
     sound &= splats.quaternions.norm(dim=1) > 0
     unsound = int((~sound).sum())
+    if unsound == len(splats):
+        raise ValueError(
+            f"none of the {unsound} splats in {file} has values that are all finite: the file is damaged, and nothing "
+            "of it is left; make the map again, or give another"
+        )
     if unsound and not drop_unsound:
         raise ValueError(
             f"{unsound} of {len(splats)} splats in {file} have values that are not finite: the file is damaged; "

@@ -39,20 +39,31 @@ def write_ply(path: Path, final: Snapshot, *, fold: bool = False, sync: bool = F
         return _properties(folded(splats, final.kernel) if fold else splats, final.origin - origin, kernel)
 
     names, count = list(columns(slice(0, 0))), len(final.splats)
-    header = [
-        "ply", "format binary_little_endian 1.0", f"comment density {kernel}",
-        "comment origin " + " ".join(repr(float(value)) for value in origin),
-        *(["comment antialiased"] if final.antialiased else []), *_background_line(final), f"element vertex {count}",
-        *(f"property float {name}" for name in names), "end_header\n",
-    ]  # fmt: skip
     with replacing(path, sync=sync) as aside, aside.open("wb") as file:
-        file.write("\n".join(header).encode("ascii"))
+        file.write(_header(final, names, origin, kernel))
         for first in range(0, count, CHUNK):
             some = columns(slice(first, first + CHUNK))
             rows = np.empty(min(CHUNK, count - first), dtype=[(name, "<f4") for name in names])
             for name, values in some.items():
                 rows[name] = values
             file.write(rows.data)
+
+
+def ply_size(final: Snapshot) -> int:
+    """Bytes of the file that `write_ply` makes."""
+    none = Splats(**{name: value[:0] for name, value in final.splats.tensors().items()})
+    names = list(_properties(none, final.origin, final.kernel))
+    return len(_header(final, names, relative_origin(final), final.kernel)) + 4 * len(names) * len(final.splats)
+
+
+def _header(final: Snapshot, names: list[str], origin: np.ndarray, kernel: str) -> bytes:
+    lines = [
+        "ply", "format binary_little_endian 1.0", f"comment density {kernel}",
+        "comment origin " + " ".join(repr(float(value)) for value in origin),
+        *(["comment antialiased"] if final.antialiased else []), *_background_line(final),
+        f"element vertex {len(final.splats)}", *(f"property float {name}" for name in names), "end_header\n",
+    ]  # fmt: skip
+    return "\n".join(lines).encode("ascii")
 
 
 def _properties(splats: Splats, shift: np.ndarray, kernel: str) -> dict[str, np.ndarray]:
@@ -197,4 +208,4 @@ def _columns(rows: np.ndarray, names: list[str]) -> np.ndarray:
 
 
 def _tensor(values: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+    return torch.from_numpy(np.require(values, np.float32, ("C", "W")))  # a copy of what is still the file's bytes

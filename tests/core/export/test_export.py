@@ -15,10 +15,11 @@ import torch
 from plyfile import PlyData
 
 from mvsgs_core.export import __main__ as export
+from mvsgs_core.export import render_path
 from mvsgs_core.export.cameras import read_cameras
 from mvsgs_core.export.command_line import input_arguments, lens, run
 from mvsgs_core.export.earth import in_axes_of
-from mvsgs_core.export.ply import folded, read_ply, write_ply
+from mvsgs_core.export.ply import folded, ply_size, read_ply, write_ply
 from mvsgs_core.export.turning import RUB_FROM_RDF
 from mvsgs_core.geometry import so3_exp
 from mvsgs_core.georeference import Georeference, write_georeference
@@ -177,6 +178,64 @@ def test_the_command_line_says_what_is_missing(
     write_ply(tmp_path / "map.ply", final_map(1))
     assert export.main(["map.ply", *arguments]) == 1
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("words", "said"), [
+    (["a.ply", "--every", "3"], "--every is not for a .ply of splats: leave it out; it is for a mesh, cameras.json,"),
+    (["a.ply", "--trajectory", "poses.txt"], "--trajectory is not for a .ply of splats"),
+    (["a.ply", "--observations"], "--observations is not for a .ply of splats: leave it out; it is for a COLMAP model"),
+    (["a.ply", "--images"], "--images is not for a .ply of splats"),
+    (["a.ply", "--mesh", "--fold"], "--fold is not for a mesh"),
+    (["a.spz", "--voxel", "3"], "--voxel is not for .spz: leave it out; it is for a mesh"),
+    (["a.splat", "--fold"], "--fold is not for .splat"),
+    (["a.splat", "--size", "24", "32"], "--size is not for .splat"),
+    (["cameras.json", "--images"], "--images is not for cameras.json"),
+    (["poses.txt", "--antialiased"], "--antialiased is not for a trajectory"),
+])  # fmt: skip
+def test_an_option_that_a_format_does_not_read_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    run, (name, *options) = write_tiny_run(tmp_path / "run"), words
+    assert export.main([str(run), str(tmp_path / name), *options]) == 1
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / name).exists()
+
+
+@pytest.mark.parametrize("background", [None, np.array([0.39, 0.1, 1.0], np.float32)])
+@pytest.mark.parametrize("kernel", ["gaussian", "exact"])
+def test_how_large_the_file_of_a_map_is(tmp_path: Path, kernel: str, background: np.ndarray | None) -> None:
+    final = replace(final_map(4, kernel), background=background, antialiased=background is None)
+    write_ply(tmp_path / "map.ply", final)
+    assert ply_size(final) == (tmp_path / "map.ply").stat().st_size
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_map_without_splats_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    final, map_file = final_map(4), tmp_path / "map.ply"
+    write_poses(tmp_path / "poses.txt", [0.5])
+    write_ply(map_file, replace(final, splats=Splats(**{k: v[:0] for k, v in final.splats.tensors().items()})))
+    for main, out in ((export.main, ["again.ply"]), (render_path.main, ["poses.txt", "flight.mp4"])):
+        assert main([str(map_file), *(str(tmp_path / name) for name in out)]) == 1
+        assert f"{map_file} has no splats" in capsys.readouterr().err
+    final.splats.sh[:] = float("nan")
+    write_ply(map_file, final)
+    for options in ([], ["--drop-unsound"]):
+        assert export.main([str(map_file), str(tmp_path / "again.ply"), *options]) == 1
+        assert f"none of the 768 splats in {map_file} has values that are all finite" in capsys.readouterr().err
+    assert not (tmp_path / "again.ply").exists()
+
+
+def test_splats_that_were_read_are_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also of one splat, whose columns lie in the file as an array would."""
+    final = final_map(4)
+    one = replace(final, splats=Splats(**{name: value[:1] for name, value in final.splats.tensors().items()}))
+    write_ply(tmp_path / "map.ply", one)
+    data = (tmp_path / "map.ply").read_bytes()
+    monkeypatch.setattr(Path, "read_bytes", lambda path: data)
+    for value in read_ply(tmp_path / "map.ply").splats.tensors().values():
+        value.add_(1.0)
+    monkeypatch.undo()
+    assert data == (tmp_path / "map.ply").read_bytes()
 
 
 def arguments_of(*words: str) -> argparse.Namespace:
