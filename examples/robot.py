@@ -54,6 +54,7 @@ def opened(arguments: argparse.Namespace) -> Iterator[Frame]:
         name, options = "video", {"path": arguments.video, "intrinsics": intrinsics}
     else:
         name, options = arguments.dataset[0], {"path": arguments.dataset[1]}
+        options |= {"intrinsics": arguments.intrinsics} if arguments.intrinsics else {}
     check(name, **options)
     return frames(open_dataset(name, **options), arguments.fast)
 

@@ -9,6 +9,7 @@ from numbers import Real
 import numpy as np
 
 from msgs import Frame, GroundTruth
+from mvsgs_core.datasets.calibration import FISHEYE, check_lens_option, size_doubt
 from mvsgs_core.datasets.framing import Framing, Size
 from mvsgs_core.datasets.lens import Lens, guess_lens
 from mvsgs_core.mapping.keyframe_checks import is_pose
@@ -36,6 +37,8 @@ class Frames:
         self._distortion, self._fisheye = tuple(float(k) for k in distortion), fisheye
         if self._distortion and self._given is None:
             raise ValueError("distortion without intrinsics: it is known together with them")
+        if self._given is not None:
+            check_lens_option(self._given.tolist(), [*([FISHEYE] if fisheye else []), *self._distortion])
         self._framing, self._posed = Framing(size), posed
         self._count, self._last = 0, -math.inf
 
@@ -53,7 +56,7 @@ class Frames:
         world_from_cam = self._pose(pose)
         seen = _mask(mask, size)
         if self.lens is None:
-            self.lens, self.notices = lens, self._framing.notice(size)
+            self.lens, self.notices = lens, size_doubt(lens, "intrinsics=") + self._framing.notice(size)
         shown, focal = self._framing.image(np.array(image, order="C"), lens, self._framing.size_of(size))
         index = self._count
         self._count, self._last = index + 1, seconds

@@ -113,7 +113,8 @@ class Mapping:
         - `loss`: what the mapper minimizes in place of its own, see mvsgs_core/mapping/losses.py.
         - `map`: output of a run with keep_map=true, or of `save`, that is gone on with.
 
-        Raises ValueError for settings that are none, with those there are; OSError for weights that are missing.
+        Raises TypeError or ValueError for settings that are none, with those there are, and for intrinsics that no
+        camera has; OSError for weights that are missing.
         """
         self._lock = threading.RLock()
         self._frames = Frames(intrinsics, distortion, fisheye, size, poses)
@@ -377,7 +378,9 @@ class Mapping:
 
 
 def _check_setting(word: str) -> None:
-    """Raises ValueError for what is none of a Mapping's."""
+    """Raises TypeError, ValueError for what is none of a Mapping's."""
+    if not isinstance(word, str):
+        raise TypeError(f"{word!r}: a setting is a text like 'mapper.iterations=300'; of a list: Mapping(*settings)")
     root = parse(word).key_or_group.partition(".")[0]
     if root not in (*SLOTS, *SETTINGS):
         raise ValueError(f"{word}: a Mapping has settings of {', '.join((*SLOTS, *SETTINGS))}")

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 _NARROWEST, _WIDEST = 1000.0, 0.01  # focal lengths as multiples of the longer side: 0.06 and 179 degrees of view
+FOCAL_RANGE = 0.05, 100.0  # of the longer side of an image without distortion: 170 degrees of view to half a degree
 _OFF_CENTER = 2.0  # image sizes from the middle: a principal point farther out is not even that of a cropped picture
 _LONGEST_SIDE = 2**20  # pixels
 CONTRAST, REST = 96, 0.98  # gray levels between the darkest and brightest of an image, without 1 % of it at each end
@@ -45,8 +46,14 @@ def check_intrinsics(intrinsics: np.ndarray, size: tuple[int, int]) -> None:
     longer = max(size)
     if not all(_WIDEST * longer <= f <= _NARROWEST * longer for f in (fx, fy)):
         raise ValueError(f"focal lengths fx, fy = {fx:g}, {fy:g} are no camera's with {width}x{height} pixels")
-    if abs(cx - 0.5 * width) > _OFF_CENTER * width or abs(cy - 0.5 * height) > _OFF_CENTER * height:
+    if not is_near_middle(intrinsics, size):
         raise ValueError(f"principal point cx, cy = {cx:g}, {cy:g} is far outside of {width}x{height} pixels")
+
+
+def is_near_middle(intrinsics: np.ndarray, size: tuple[int, int]) -> bool:
+    """Whether the principal point lies where that of an image (height, width) can; NaN does not."""
+    off = np.abs(np.asarray(intrinsics, dtype=np.float64)[2:] - [0.5 * size[1], 0.5 * size[0]])
+    return bool(np.all(off <= [_OFF_CENTER * size[1], _OFF_CENTER * size[0]]))
 
 
 def scale_intrinsics(intrinsics: np.ndarray, from_size: tuple[int, int], to_size: tuple[int, int]) -> np.ndarray:

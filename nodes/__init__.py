@@ -164,6 +164,10 @@ def outputs(node: type[Node]) -> tuple[type, ...]:
         returned = _hints(node, name).get("return")
         if returned is None:
             raise TypeError(f"{node.__qualname__}.{name} must say what it yields: -> Iterator[Keyframe]")
+        for alone in set(_alternatives(returned)) & set(msgs.TYPES.values()):
+            raise TypeError(
+                f"{node.__qualname__}.{name} must yield its messages, not return one: -> Iterator[{alone.__name__}]"
+            )
         for t in _message_types(returned):
             found[t] = None
     return tuple(found)

@@ -11,6 +11,7 @@ import numpy as np
 from msgs import End, Frame
 from msgs.codec import CodecError
 from mvsgs_core.camera import resize_image, scale_intrinsics
+from mvsgs_core.datasets.calibration import size_doubt
 from mvsgs_core.datasets.framing import Framing, target_size
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.export.source_camera import LENS, lens_values
@@ -108,7 +109,10 @@ class Robot(LiveSource):
         size = target_size(self.config.size, native)
         if LENS not in self.stats.values:
             fx, fy, cx, cy = frame.intrinsics.tolist()
-            self.stats.values[LENS] = lens_values(Lens((fx, fy, cx, cy), native, guessed=frame.intrinsics_guessed))
+            lens = Lens((fx, fy, cx, cy), native, guessed=frame.intrinsics_guessed)
+            self.stats.values[LENS] = lens_values(lens)
+            for doubt in size_doubt(lens, "intrinsics="):
+                self.stats.warn(f"the robot's frames: {doubt}")
             for note in Framing(self.config.size).notice(native):
                 self.stats.warn(note)
         intrinsics = scale_intrinsics(frame.intrinsics, native, size)

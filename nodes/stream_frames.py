@@ -9,14 +9,17 @@ from dataclasses import replace
 import numpy as np
 
 from msgs import Frame
+from mvsgs_core.camera import FOCAL_RANGE, is_near_middle
 from mvsgs_core.printable import printable
 from mvsgs_core.stats import Stats
 from mvsgs_core.stream_times import LATEST, StreamTimes
 
-FOCAL_RANGE = 0.02, 100.0  # of the larger side of the image: beyond a fisheye and a telescope nothing can be tracked
 MIN_SIDE, MAX_SIDE = 16, 16384  # pixels of a side
 CLOCKS_END = 2.0**31  # seconds: what ROS 2 can say
 BEHIND = 2.0  # s of delay that a user should know of
+SAME = 1e-3  # intrinsics that differ by less are those of one camera
+RUSHING = 100.0  # times as far as the time between two frames: stamps that advance so for `BRIEF` are no seconds
+BRIEF = 1.0  # s
 DRIFT = 5e-4  # that two clocks may run apart, one of them being set gently: 50 ppm alone make 2 s in 11 hours
 
 
@@ -38,16 +41,20 @@ class StreamFrames:
         self._stamped = stamped
         self._times = StreamTimes()
         self._newest: Frame | None = None  # as it came
+        self._intrinsics: np.ndarray | None = None  # (4,) of all, once the first has come
         self._restarted = False
         self._promptest = math.inf  # s from a frame's time to its coming, by two clocks
         self._timed = 0.0  # by time.monotonic: when the last frame's delay was taken
+        self._shown = math.inf  # the last frame's time
+        self._rushing: float | None = None  # by time.monotonic: since when stamps advance too far; None: they do not
 
     def restarted(self) -> None:
         """The sender's program started again: its clock may be another."""
         self._restarted = True
 
     def accept(self, frame: Frame) -> Frame | None:
-        """The frame at a time after all before it; None, with a warning, if it cannot belong to the same stream."""
+        """The frame at a time after all before it, with the intrinsics of the first; None, with a warning, if it cannot
+        belong to the same stream."""
         wrong = self._fault(frame)
         if wrong is None:
             self.heard = time.monotonic()
@@ -56,13 +63,26 @@ class StreamFrames:
             self.refuse(placed)
             return None
         self.native, self._newest = (frame.image.shape[0], frame.image.shape[1]), frame
-        return replace(frame, timestamp=placed, stamp=frame.stamp or _stamp(frame.timestamp))
+        intrinsics, stamp = self._one_camera(frame), frame.stamp or _stamp(frame.timestamp)
+        return replace(frame, timestamp=placed, intrinsics=intrinsics, stamp=stamp)
 
     def refuse(self, why: str) -> None:
         """One that was left out."""
         self.refused = self.refused or printable(why)
         self._stats.count("unusable")
         self._stats.warn(why)
+
+    def _one_camera(self, frame: Frame) -> np.ndarray:
+        """(4,): those of the first frame, whatever comes with later ones."""
+        if self._intrinsics is None:
+            self._intrinsics = frame.intrinsics.copy()  # a view would keep the whole frame
+        elif not np.allclose(frame.intrinsics, self._intrinsics, rtol=SAME):
+            self._stats.count("other_intrinsics")
+            self._stats.warn(
+                f"{self._sender}'s intrinsics change between frames: those of the first are used for all; after a "
+                "zoom, or for another camera, begin another run"
+            )
+        return self._intrinsics
 
     def _placed(self, frame: Frame) -> float | str:
         """Its time in the stream, or why it has none."""
@@ -84,6 +104,7 @@ class StreamFrames:
         return shown
 
     def _note_delay(self, now: float, shown: float) -> None:
+        self._note_unit(now, shown)
         lag = now - shown
         self._promptest, self._timed = min(self._promptest + DRIFT * (now - self._timed), lag), now
         delay = lag - self._promptest
@@ -93,6 +114,19 @@ class StreamFrames:
                 f"frames of {self._sender} come more than {BEHIND:g} s later than they should by their timestamps: the "
                 "link, or the program that sends them, is slower than the stream"
             )
+
+    def _note_unit(self, now: float, shown: float) -> None:
+        """Of stamps that advance much farther than the time in which frames come."""
+        if shown - self._shown <= RUSHING * (now - self._timed):
+            self._rushing = None
+        elif self._rushing is None:
+            self._rushing = self._timed
+        elif now - self._rushing > BRIEF:
+            self._stats.warn(
+                f"{self._sender}'s timestamps advance over {RUSHING:g} times as fast as its frames come: they look "
+                "like milliseconds, and must be seconds"
+            )
+        self._shown = shown
 
     def _doubled(self, frame: Frame) -> bool:
         last = self._newest
@@ -104,7 +138,7 @@ class StreamFrames:
     def _fault(self, frame: Frame) -> str | None:
         native = frame.image.shape[0], frame.image.shape[1]
         side = max(native)
-        focal, center = frame.intrinsics[:2], frame.intrinsics[2:]
+        focal = frame.intrinsics[:2]
         if not MIN_SIDE <= min(native) <= side <= MAX_SIDE:
             return f"frames with sides outside of {MIN_SIDE} to {MAX_SIDE} pixels were left out, such as {native}"
         if self.native not in (None, native):
@@ -113,7 +147,7 @@ class StreamFrames:
         in_view = np.all((FOCAL_RANGE[0] * side <= focal) & (focal <= FOCAL_RANGE[1] * side))
         if not abs(frame.timestamp) <= LATEST:
             return f"frames whose timestamp is no time in seconds (beyond {LATEST:g}) were left out"
-        if not in_view or not np.all(np.abs(center) <= 2 * side):
+        if not in_view or not is_near_middle(frame.intrinsics, native):
             return f"frames without valid intrinsics were left out, such as {frame.intrinsics.tolist()} for {native}"
         return None
 

@@ -126,6 +126,7 @@ REFUSED = [
     ([f"relay._target_={STAGES}.np"], "is no node", "has: Source"),
     ([f"relay._target_={STAGES}.Bare"], "neither run() nor", ""),
     ([f"relay._target_={STAGES}.Untyped"], "must take one message", ""),
+    ([f"relay._target_={STAGES}.Returning"], "Returning.on_frame must yield its messages", "-> Iterator[Keyframe]"),
     ([f"relay._target_={STAGES}.Undecorated"], "Undecorated.Config must be a dataclass", "write @dataclass above it"),
     ([f"relay._target_={STAGES}.Added"], "Added.Config must be a dataclass", "write @dataclass(frozen=True) above it"),
     ([f"relay._target_={STAGES}.Source"], "nobody sends", "yields Frame, GroundTruth"),

@@ -234,6 +234,28 @@ def test_settings_that_are_none_are_refused(words: list[str], said: str) -> None
         Mapping(*words)
 
 
+@pytest.mark.parametrize("setting", [3, ["mapper.iterations=3"], None])
+def test_a_setting_that_is_no_text_is_refused(setting: Any) -> None:
+    with pytest.raises(TypeError, match="a setting is a text"):
+        Mapping(setting)
+
+
+@pytest.mark.parametrize("intrinsics", [[-5, 60, 31.5, 23.5], [0.01, 0.01, 31.5, 23.5], [1, 2, 3]])
+def test_intrinsics_that_no_camera_has_are_refused_before_any_frame(intrinsics: list[float]) -> None:
+    with pytest.raises(ValueError, match=r"focal lengths|four finite numbers"):
+        Mapping(*SMALL, intrinsics=intrinsics)
+
+
+def test_intrinsics_of_images_of_another_size_are_doubted() -> None:
+    mapping = Mapping(*SMALL, intrinsics=[120, 120, 63.5, 47.5])
+    mapping.add(IMAGE, 0.0)
+    assert any("64x48" in line and "another size (about 128x96)" in line for line in mapping.warnings)
+    turned = Mapping(*SMALL, intrinsics=[60, 60, 23.5, 31.5])
+    turned.add(IMAGE, 0.0)
+    (doubt,) = [line for line in turned.warnings if "principal point" in line]
+    assert "give intrinsics=[60,60,31.5,23.5]" in doubt
+
+
 def test_given_poses_and_a_loss_of_ones_own(items: tuple[Item, ...]) -> None:
     seen: list[int] = []
 

@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import time
+from dataclasses import replace
+from itertools import count
+
 import numpy as np
+import pytest
 
 from msgs import Frame
+from mvsgs_core.mapping.keyframe_checks import checked_keyframe
+from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.stats import Stats
 from nodes.stream_frames import StreamFrames
 
@@ -34,3 +41,44 @@ def test_a_stamp_that_is_given_stays_and_a_time_of_no_clock_gives_none() -> None
     late = StreamFrames(Stats(), "robot").accept(given[2])
     assert late is not None
     assert late.stamp == 0
+
+
+def test_intrinsics_are_those_of_the_first_frame_and_a_change_is_said() -> None:
+    stats = Stats()
+    stream, ours = StreamFrames(stats, "the robot"), frame(0, 0.0).intrinsics
+    changed = [frame(k, k / 10) for k in range(6)]
+    changed[3:] = [replace(each, intrinsics=1.5 * ours) for each in changed[3:]]
+    for each in changed:
+        taken = stream.accept(each)
+        assert taken is not None
+        np.testing.assert_array_equal(taken.intrinsics, ours)
+        assert stats.counts.get("other_intrinsics", 0) == max(0, each.index - 2)
+        assert any("the robot's intrinsics change" in line for line in stats.warnings) == (each.index > 2)
+
+
+@pytest.mark.parametrize(
+    ("center", "usable"), [((79.0, 11.5), True), ((81.0, 11.5), False), ((15.5, -35.0), True), ((15.5, -37.0), False)]
+)
+def test_a_principal_point_that_the_mapper_refuses_is_refused_at_once(
+    center: tuple[float, float], usable: bool
+) -> None:
+    first = replace(frame(0, 0.0), intrinsics=np.array([25.0, 25.0, *center]))
+    assert (StreamFrames(Stats(), "robot").accept(first) is not None) == usable
+    mapped = RGBDKeyframe(0, first.image, first.intrinsics, np.eye(4), np.ones((24, 32), np.float32))
+    assert (checked_keyframe(mapped, Stats()) is not None) == usable
+
+
+@pytest.mark.parametrize(
+    ("unit", "jump", "said"), [(1000.0, 0.0, True), (1.0, 0.0, False), (30.0, 0.0, False), (1.0, 3000.0, False)],
+    ids=["milliseconds", "seconds", "a recording played faster", "a clock that is set"],
+)  # fmt: skip
+def test_stamps_in_milliseconds_are_told(unit: float, jump: float, said: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = count(1000.0, 1 / 15)
+    stats, came = Stats(), 0.0
+    stream = StreamFrames(stats, "the robot")
+    monkeypatch.setattr(time, "monotonic", lambda: came)
+    for k in range(45):
+        came = next(now)
+        assert stream.accept(frame(k, unit * k / 15 + (jump if k > 20 else 0.0))) is not None
+        assert k > 10 or not stats.warnings  # not at once
+    assert any("look like milliseconds" in line for line in stats.warnings) == said

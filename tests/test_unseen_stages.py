@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from launch.jobs import elsewhere
 from launch.outcome import Failure, Outcome
 from launch.output import Output, read_report
+from mvsgs_core.mapping.checkpoints.files import CheckpointInfo
 
+HALFWAY = CheckpointInfo(Path("state-00000001.npz"), 40, 4.0, np.arange(5) * 10, 1000, finished=False)
 UNSEEN = Outcome(1, "mapper is external: its end is not known here", unseen=("mapper",))
 
 
 @pytest.fixture
 def output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Output:
     """With an evaluator's report and a checkpoint."""
-    monkeypatch.setattr("launch.output.checkpoint_info", lambda folder: None)
+    monkeypatch.setattr("launch.output.checkpoint_info", lambda folder: HALFWAY)
     claimed = Output(tmp_path)
     claimed.begin({}, "mvsgs", resumed=False)
     claimed.write_report({"finished": True, "rendering": {"psnr": 30.0}})

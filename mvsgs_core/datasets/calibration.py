@@ -66,8 +66,11 @@ def check_lens_option(
     lens_from_option(intrinsics, distortion, (size[0], size[1]))
 
 
-def size_doubt(lens: Lens) -> list[str]:
-    """What to say of intrinsics that look like those of images of another size than the lens's, or of turned ones."""
+def size_doubt(lens: Lens, option: str = "dataset.intrinsics=") -> list[str]:
+    """What to say of intrinsics that look like those of images of another size than the lens's, or of turned ones.
+
+    option: by which they are given.
+    """
     (height, width), (fx, fy, cx, cy) = lens.size, lens.intrinsics
     off = _off_middle(lens, lens.size)
     if _off_middle(lens, (width, height)) <= _NEAR and off > 2 * _NEAR:
@@ -75,7 +78,7 @@ def size_doubt(lens: Lens) -> list[str]:
         return [
             f"the principal point cx, cy = {cx:g}, {cy:g} is that of images of {height}x{width}, and these are "
             f"{width}x{height}: if the two were exchanged, or the camera was turned after its calibration, give "
-            f"dataset.intrinsics=[{fx:g},{fy:g},{cy:g},{cx:g}]{turned}"
+            f"{option}[{fx:g},{fy:g},{cy:g},{cx:g}]{turned}"
         ]
     theirs = 2 * cx + 1, 2 * cy + 1
     such = f" (about {theirs[0]:.0f}x{theirs[1]:.0f})" if min(cx, cy) > 0 else ""

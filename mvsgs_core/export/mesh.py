@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -33,9 +34,11 @@ def write_mesh(
 
     voxel: edge in median depths. Pixels of an opacity below `min_opacity` say nothing. Positions are world coordinates,
     in the axes of map.ply except for .glb, whose axes are defined. Returns the numbers of vertices and triangles.
-    Raises ValueError for another suffix, and where no camera sees the map, the depth makes no surface, or .stl would
-    round it away.
+    Raises ValueError for another suffix, a voxel that is none, and where no camera sees the map, the depth makes no
+    surface, or .stl would round it away.
     """
+    if not 0.0 < voxel < math.inf:
+        raise ValueError(f"a voxel of {voxel:g} median depths: its edge must be above 0, such as 0.01")
     if path.suffix not in SUFFIXES:
         raise ValueError(f"no mesh is written as {path.suffix!r}: there are {', '.join(SUFFIXES)}")
     o3d = open3d()

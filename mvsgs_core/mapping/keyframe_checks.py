@@ -10,14 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from mvsgs_core.camera import is_readout_time
+from mvsgs_core.camera import FOCAL_RANGE, is_near_middle, is_readout_time
 from mvsgs_core.mapping.frame_of_reference import FAR
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.stats import Stats
 
 MIN_SIDE = 8  # pixels of an image
-FOCAL = (0.05, 100.0)  # focal lengths over the image's larger side: 170 degrees to half a degree
-OFF_CENTER = 1.0  # image sizes that the principal point may lie outside of the image
 NO_SHUTTER = "photographs whose size, velocity or readout time no camera has were trained on without their shutter"
 NO_POSE = "a corrected pose that is not finite, or none at all, was refused"
 
@@ -65,7 +63,7 @@ def is_pose(world_from_cam: np.ndarray, scale: float) -> bool:
 def _problem(view: RGBDKeyframe) -> str:
     """Why it cannot be mapped; empty if it can."""
     height, width = view.image.shape[:2]
-    size, fx, fy, cx, cy = max(height, width), *np.asarray(view.intrinsics, dtype=np.float64)
+    size, focal = max(height, width), np.asarray(view.intrinsics, dtype=np.float64)[:2]
     if min(height, width) < MIN_SIDE:
         return f"an image smaller than {MIN_SIDE} pixels"
     if view.depth.ndim != 2 or view.depth.size == 0:
@@ -77,9 +75,9 @@ def _problem(view: RGBDKeyframe) -> str:
         return "a mask of another size than its image"
     if not np.isfinite(view.intrinsics).all():
         return "a pose or intrinsics that are not finite"
-    if not all(FOCAL[0] * size <= f <= FOCAL[1] * size for f in (fx, fy)):
+    if not all(FOCAL_RANGE[0] * size <= f <= FOCAL_RANGE[1] * size for f in focal):
         return "a focal length that no camera has"
-    if not (abs(cx - width / 2) < (0.5 + OFF_CENTER) * width and abs(cy - height / 2) < (0.5 + OFF_CENTER) * height):
+    if not is_near_middle(view.intrinsics, (height, width)):
         return "a principal point far outside of the image"
     if not (np.isfinite(view.world_from_cam).all() and np.isfinite(view.scale)):
         return "a pose or intrinsics that are not finite"

@@ -10,6 +10,8 @@ from collections import Counter
 
 import numpy as np
 
+from mvsgs_core.bad_file import BadFileError
+from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.tracking.estimation.calibration import LAST
 from mvsgs_core.tracking.frames import FrameRecord
 from mvsgs_core.tracking.known_map import KnownMap
@@ -21,13 +23,13 @@ MAX_OFFSET = 0.01  # of the image's width: by which a camera's rays may miss tho
 LOST_AT_FIRST = "frames before the camera was found in the map"
 
 
-def go_on(session: Session, known: KnownMap) -> None:
-    """Gives a session that has seen no frame the keyframes of a map.
+def go_on(session: Session, known: KnownMap, frames: tuple[int, int]) -> None:
+    """Gives a session that has seen no frame the keyframes of a map. frames: their (height, width), as they come.
 
-    The map's intrinsics hold: those of the frames must be near them, unless they are a guess. Raises ValueError for
+    The map's intrinsics hold: those of the frames must be near them, unless they are a guess. Raises BadFileError for
     another camera.
     """
-    _check_camera(session, known)
+    _check_camera(session, known, frames)
     graph = session.graph
     graph.intrinsics, graph.vignetting = known.intrinsics.copy(), known.vignetting.copy()
     if session.calibration.readout_time is None:
@@ -55,11 +57,11 @@ def go_on(session: Session, known: KnownMap) -> None:
     session.phase = Phase.RELOCALIZING
 
 
-def _check_camera(session: Session, known: KnownMap) -> None:
+def _check_camera(session: Session, known: KnownMap, frames: tuple[int, int]) -> None:
     if session.matcher.flow.needs_color and any(keyframe.image.color is None for keyframe in known.keyframes):
-        raise ValueError("the map was tracked in gray, and tracker.flow needs its colors: use the flow of that run")
+        raise BadFileError("the map was tracked in gray, and tracker.flow needs its colors: use the flow of that run")
     if known.size != session.size:
-        raise ValueError(
+        raise BadFileError(
             f"the map was tracked at {known.size[1]}x{known.size[0]} pixels, these frames are at {session.size[1]}x"
             f"{session.size[0]}: give frames of the same shape and the tracker.area of that run"
         )
@@ -70,10 +72,13 @@ def _check_camera(session: Session, known: KnownMap) -> None:
     rays = (corners - session.intrinsics[2:]) / session.intrinsics[:2]
     off = np.abs(rays * known.intrinsics[:2] + known.intrinsics[2:] - corners).max()
     if off > MAX_OFFSET * width:
-        fx, fy, cx, cy = known.intrinsics
-        raise ValueError(
-            f"the map was made by another camera: at {width}x{height} pixels its intrinsics are [{fx:.1f}, {fy:.1f}, "
-            f"{cx:.1f}, {cy:.1f}], and those of these frames are {np.round(session.intrinsics, 1).tolist()}"
+        its, theirs = (
+            np.round(scale_intrinsics(each, known.size, frames), 1).tolist()
+            for each in (known.intrinsics, session.intrinsics)
+        )
+        raise BadFileError(
+            f"the map was made by another camera: at {frames[1]}x{frames[0]} pixels its intrinsics are {its}, those of "
+            f"these frames are {theirs}; give frames of that camera, or its intrinsics, or begin a map of their own"
         )
 
 

@@ -38,6 +38,7 @@ NOT_FOUND = (
     "the camera was not found at once in the map to go on in: a part of its own was begun, which is joined to it where "
     "the camera comes by"
 )
+SAME = 1e-3  # intrinsics that differ by less are those of one camera
 SPARED = "keyframes, about: farther apart, as the tracker took more than its share of time"
 
 
@@ -121,6 +122,12 @@ class Tracker:
         """Whether that is the time of its columns, not of its rows."""
         return self._session is not None and self._session.graph.reads_columns
 
+    def used_intrinsics(self, came: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """(4,) that the pose of a frame (height, width) is found with, but for the focal factor: those that came with
+        it, `came`, where they are the first frame's; else the first frame's."""
+        ours = scale_intrinsics(self.session.intrinsics, self.session.size, size)
+        return came if np.allclose(came, ours, rtol=SAME) else ours
+
     def keyframe(self, index: int) -> Keyframe:
         return self.session.graph.keyframes[index]
 
@@ -164,7 +171,7 @@ class Tracker:
 
         original: see `follow`.
 
-        Raises ValueError for another camera than that of the map to go on in.
+        Raises BadFileError for another camera than that of the map to go on in.
         """
         kind = FrozenSession if self._frozen else Session
         session = kind(self.config, self.stats, size, intrinsics, guessed)
@@ -172,7 +179,7 @@ class Tracker:
             session.calibration.original = np.array(original, np.float64)
         if self._known is not None:
             with self.stats.time("taking up the map"):
-                go_on(session, self._known)
+                go_on(session, self._known, size)
             self._known = None
         self._session = session
         return session
@@ -235,7 +242,7 @@ class Tracker:
         """
         size = image.shape[0], image.shape[1]
         session = self._session or self.begin(size, intrinsics, guessed, original)
-        if not np.allclose(scale_intrinsics(intrinsics, size, session.size), session.intrinsics, rtol=1e-3):
+        if self.used_intrinsics(intrinsics, size) is not intrinsics:
             self.stats.warn("the intrinsics change between frames: the tracker goes on with those of the first")
         with self.stats.time("image"):
             color = session.matcher.flow.needs_color

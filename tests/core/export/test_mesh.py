@@ -144,6 +144,12 @@ def test_a_format_that_no_mesh_has_is_refused(tmp_path: Path, capsys: pytest.Cap
     assert "no mesh is written as '.splat': there are .glb, .ply" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("voxel", [0.0, -1.0, np.nan, np.inf])
+def test_a_voxel_that_is_none_is_refused(tmp_path: Path, voxel: float) -> None:
+    with pytest.raises(ValueError, match="its edge must be above 0"):
+        write_mesh(tmp_path / "mesh.glb", final_map(1), cameras_around([0.5], SIZE, INTRINSICS), voxel)
+
+
 def test_views_are_fused_one_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All images of a long run would fill the memory."""
     grid, done = open3d().t.geometry.VoxelBlockGrid, []

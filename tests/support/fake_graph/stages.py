@@ -191,6 +191,13 @@ class Untyped(Node):
         yield frame
 
 
+class Returning(Node):
+    """Returns what it should yield."""
+
+    def on_frame(self, frame: Frame) -> Keyframe | None:
+        return None
+
+
 class Loop(Node):
     """Keyframe -> Frame: closes a cycle with Relay."""
 
