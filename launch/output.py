@@ -42,13 +42,13 @@ class Output:
     """A claimed output directory."""
 
     def __init__(self, path: Path, *, resumable: bool = True) -> None:
-        """resumable: such a run can be gone on with. Raises GraphError where the directory cannot be made, or where
-        another run is writing to it."""
+        """resumable: such a run can be gone on with. Raises GraphError where the directory cannot be made, where others
+        than a run keep their files, or where another run is writing to it."""
         self.path, self._resumable = path, resumable
         self.resume: str | None = None  # the command that goes on with the run, once it has ended early
-        if path.exists() and not path.is_dir():
-            raise GraphError(f"output={path}: is a file; the output is a folder")
         try:
+            if found := file_in_the_way(path) or _of_all(path):
+                raise GraphError(f"output={path}: {found}")
             path.mkdir(parents=True, exist_ok=True)
             self._lock = _lock(path / LOCK)
         except BlockingIOError as error:
@@ -154,11 +154,37 @@ class Output:
         return f"{len(kept)} of them, " + (f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.0f} MB")
 
 
+def file_in_the_way(folder: Path) -> str | None:
+    """Why there can be no such folder, as a file is in its place, or in that of one above. Raises OSError."""
+    for place in (folder, *folder.parents):
+        if place.exists() and not place.is_dir():
+            return f"{'' if place == folder else f'{place} '}is a file; give the name of a folder"
+    return None
+
+
+def _of_all(folder: Path) -> str | None:
+    """Why a run's files are not to lie in that folder itself."""
+    home = os.path.expanduser("~")  # noqa: PTH111  # raises nothing where a user has none
+    if _same(folder, Path("/")):
+        what = "the root of the file system"
+    elif _same(folder, Path(home)) and not is_of_a_run(folder):
+        what = "your home folder"
+    else:
+        return None
+    return f"is {what}; a run needs a folder of its own, such as {folder / 'runs' / 'first'}"
+
+
+def _same(folder: Path, other: Path) -> bool:
+    return folder.exists() and other.exists() and folder.samefile(other)
+
+
 def _resume_command(output: Path) -> str | None:
-    """What goes on with an unfinished run; None where it left no checkpoint."""
+    """What goes on with an unfinished run; None where it left no checkpoint, or none but the map that it began on."""
     try:
-        checkpoint_info(output)
+        found = checkpoint_info(output)
     except ValueError:
+        return None
+    if found.newest_keyframe_index < 0 and not found.finished:
         return None
     return shlex.join([sys.executable, str(RUN_ALL), f"resume={output}"])
 

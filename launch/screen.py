@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 
 import psutil
-from rich.console import Console
+from rich.cells import cell_len
+from rich.console import Console, JustifyMethod
 from rich.live import Live
 from rich.table import Table
 
@@ -19,6 +20,10 @@ from launch.status import NodeStatus, total
 
 PLAIN_SECONDS = 5.0  # between two lines
 FOLLOWED = ("frames", "keyframes", "views", "splats", "iterations")
+LEAST_COLUMNS = 70  # of a terminal whose table has more to tell than lines
+SPARED = ("skipped", "memory", "cpu", "in", "out", "queue")  # columns that a narrow terminal lacks, the first first
+LEFT = ("node", "state", "progress", "skipped")
+PROGRESS, SKIPPED = 24, 20  # their least width: progress always has it, so that the table keeps still
 
 
 class _Console(Console):
@@ -114,27 +119,31 @@ class LiveScreen(Screen):
             self._live = None
 
     def _table(self) -> Table:
-        table = Table(title=f"{self.seconds:.0f} s", title_justify="left", expand=False)
-        for column in ("node", "state", "in", "queue", "out"):
-            table.add_column(column, justify="left" if column in ("node", "state") else "right")
-        table.add_column("progress", min_width=24)
-        table.add_column("skipped")
-        table.add_column("cpu", justify="right")
-        table.add_column("memory", justify="right")
-        for name, status in self._nodes.items():
-            cpu, memory = self._load(status)
-            table.add_row(
-                name,
-                status.state,
-                str(total(status.received) or ""),
-                str(total(status.queue) or ""),
-                str(total(status.sent) or ""),
-                progress(status),
-                figures(status.skipped),
-                cpu,
-                memory,
-            )
+        rows = [self._row(name, status) for name, status in self._nodes.items()]
+        names = ("node", "state", "in", "queue", "out", "progress", "skipped", "cpu", "memory")
+        columns = {name: [row[name] for row in rows] for name in names}
+        table = Table(title=f"{self.seconds:.0f} s", title_justify="left")
+        widths = _widths(columns, self.console.width)
+        for name, width in widths.items():
+            justify: JustifyMethod = "left" if name in LEFT else "right"
+            table.add_column(name, width=width, no_wrap=name != "progress", justify=justify)
+        for row in rows:
+            table.add_row(*(row[name] for name in widths))
         return table
+
+    def _row(self, name: str, status: NodeStatus) -> dict[str, str]:
+        cpu, memory = self._load(status)
+        return {
+            "node": name,
+            "state": status.state,
+            "in": str(total(status.received) or ""),
+            "queue": str(total(status.queue) or ""),
+            "out": str(total(status.sent) or ""),
+            "progress": progress(status),
+            "skipped": figures(status.skipped),
+            "cpu": cpu,
+            "memory": memory,
+        }
 
     def _load(self, status: NodeStatus) -> tuple[str, str]:
         """CPU since the last look and resident memory: the system's figures, the node's last ones once it is gone."""
@@ -147,11 +156,29 @@ class LiveScreen(Screen):
         return cpu, f"{memory / 2**20:.0f} MB" if memory else ""
 
 
+def _widths(columns: Mapping[str, Sequence[str]], room: int) -> dict[str, int]:
+    """Widths of the columns that a line of `room` characters has room for: whole ones, but for progress, which wraps,
+    and what was skipped, which is cut and whole in the report."""
+    whole = {name: max(map(cell_len, (name, *texts))) for name, texts in columns.items()}
+    widths = whole | {"progress": PROGRESS, "skipped": min(SKIPPED, whole["skipped"])}
+
+    def free() -> int:
+        return room - 1 - sum(3 + width for width in widths.values())  # borders, and a blank on both sides
+
+    for name in SPARED:
+        if free() < 0:
+            del widths[name]
+    for name in ("progress", "skipped"):
+        if name in widths:
+            widths[name] = max(1, min(max(whole[name], widths[name]), widths[name] + free()))
+    return widths
+
+
 def make_screen(kind: str, console: Console | None = None) -> Screen:
-    """The screen of `screen=auto|live|plain|off`: auto is live on a terminal, plain elsewhere."""
+    """The screen of `screen=auto|live|plain|off`: auto is live on a terminal that has room for it, plain elsewhere."""
     console = console or _Console(highlight=False)
     if kind == "auto":
-        kind = "live" if console.is_terminal else "plain"
+        kind = "live" if console.is_terminal and console.width >= LEAST_COLUMNS else "plain"
     return {"live": LiveScreen, "plain": PlainScreen, "off": Screen}[kind](console)
 
 

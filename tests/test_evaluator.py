@@ -53,6 +53,7 @@ def test_report(evaluator: Evaluator) -> None:
         "scale_ratio": pytest.approx(1.0),
         "count": 1,
     }
+    assert "depth is scored of 1 of 4 keyframes: that of the others did not come" in " ".join(report["notes"])
     assert report["map"]["splats"] == 1200
     assert report["time"]["stages"]["tracker"] == {"flow": 1.5}
     assert report["time"]["wall"] > 0

@@ -79,3 +79,18 @@ def test_the_command_makes_keys_once(tmp_path: Path, capsys: pytest.CaptureFixtu
         capsys.readouterr().err == f"error: {folder}/graph.key is there already: copy it, or delete it for new keys\n"
     )
     assert load_keys(folder) == made
+
+
+@pytest.mark.parametrize(("below", "said"), [("", "is a file"), ("below", "{} is a file")])
+def test_where_a_file_is_there_are_no_keys(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], below: str, said: str
+) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    assert keys.main([str(file / below)]) == 1
+    assert capsys.readouterr().err == f"error: {file / below}: {said.format(file)}; give the name of a folder\n"
+
+
+def test_why_keys_cannot_be_written_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    assert keys.main(["/proc/none"]) == 1
+    assert capsys.readouterr().err == "error: /proc/none: No such file or directory\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,15 @@ import pytest
 from omegaconf import OmegaConf
 
 from launch.compose import compose, graph_of
-from launch.jobs import Job, _in_its_folder, _scored
+from launch.jobs import Job, _in_its_folder, _scored, unfinished
 from launch.outcome import Outcome
 from launch.output import Output, is_of_a_run, others_files, read_report
 from launch.refusal import GraphError
+from mvsgs_core.kept_map import STREAM
+from mvsgs_core.mapping.checkpoints.files import CheckpointInfo
 from mvsgs_core.trajectory_file import write_trajectory
+
+HALFWAY = CheckpointInfo(Path("state-00000001.npz"), 40, 4.0, np.arange(5) * 10, 1000, finished=False)
 
 
 @pytest.fixture
@@ -76,7 +81,7 @@ def test_where_earlier_results_went_and_how_many_there_are_is_said(output: Outpu
 def test_what_goes_on_with_an_earlier_run_names_the_folder_where_it_is_now(
     output: Output, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("launch.output.checkpoint_info", lambda folder: None)
+    monkeypatch.setattr("launch.output.checkpoint_info", lambda folder: HALFWAY)
     output.begin({}, "mvsgs", resumed=False)
     (output.path / "map.ply").touch()
     output.settle(Outcome(1, "tracker failed"))
@@ -88,11 +93,29 @@ def test_what_goes_on_with_an_earlier_run_names_the_folder_where_it_is_now(
     assert after.items() <= before.items()
 
 
+@pytest.mark.parametrize(
+    ("found", "worth"),
+    [
+        (HALFWAY, True),
+        (replace(HALFWAY, newest_keyframe_index=40 - STREAM), False),
+        (replace(HALFWAY, newest_keyframe_index=40 - STREAM, finished=True), True),  # it is to be refined
+    ],
+)
+def test_a_run_that_added_nothing_to_the_map_that_it_began_on_is_not_said_to_go_on(
+    output: Output, monkeypatch: pytest.MonkeyPatch, found: CheckpointInfo, worth: bool
+) -> None:
+    monkeypatch.setattr("launch.output.checkpoint_info", lambda folder: found)
+    output.begin({}, "mvsgs map=kept", resumed=False)
+    output.settle(Outcome(1, "tracker failed"))
+    assert (output.resume is not None) == worth
+    assert ("run it again" in unfinished(output)) == (not worth)
+
+
 def test_a_run_whose_order_cannot_be_taken_up_again_is_not_said_to_go_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Photographs are registered in an order of their own; `resume=` would refuse."""
-    monkeypatch.setattr("launch.output.checkpoint_info", lambda folder: None)
+    monkeypatch.setattr("launch.output.checkpoint_info", lambda folder: HALFWAY)
     output = Output(tmp_path / "photographs", resumable=False)
     output.begin({}, "mvsgs", resumed=False)
     output.settle(Outcome(1, "mapper failed"))
@@ -173,3 +196,39 @@ def test_only_the_evaluators_report_is_waited_for(output: Output) -> None:
     output.settle(Outcome(), scored=_scored(graph))
     assert read_report(output.path)["finished"] is True
     assert _scored(compose(["evaluator=external"]))
+
+
+@pytest.fixture
+def never_locked(monkeypatch: pytest.MonkeyPatch) -> None:
+    def locked(path: Path) -> int:
+        raise AssertionError(f"{path} would be written")
+
+    monkeypatch.setattr("launch.output._lock", locked)
+
+
+@pytest.mark.usefixtures("never_locked")
+def test_neither_the_root_nor_the_home_folder_itself_is_an_output(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "root").symlink_to("/")
+    for root in (Path("/"), Path("//"), tmp_path / "root"):
+        with pytest.raises(GraphError, match=f"output={root}: is the root of the file system; .*such as {root}"):
+            Output(root)
+    home = tmp_path / "home"
+    home.mkdir()
+    monkeypatch.setenv("HOME", str(home))
+    with pytest.raises(GraphError, match=f"output={home}: is your home folder; .* such as {home}/runs/first"):
+        Output(home)
+    (home / "report.json").write_text('{"finished": false}')  # of a run that is to be gone on with
+    for folder in (home, home / "runs"):
+        with pytest.raises(AssertionError, match="would be written"):
+            Output(folder)
+
+
+@pytest.mark.usefixtures("never_locked")
+def test_a_file_in_the_way_of_the_output_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    for path, said in ((file, "is a file"), (file / "a" / "b", f"{file} is a file")):
+        with pytest.raises(GraphError, match=f"output={path}: {said}; give the name of a folder"):
+            Output(path)

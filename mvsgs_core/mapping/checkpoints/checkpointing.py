@@ -80,7 +80,9 @@ class Checkpointing:
             log.refuse("checkpoints", 1, f"no last checkpoint: {error}")
         self._pass_problems_on(log)
 
-    def finish(self, atlas: Atlas, source: SourceCamera | None = None, rest: Callable[[], object] = lambda: None) -> int:
+    def finish(
+        self, atlas: Atlas, source: SourceCamera | None = None, rest: Callable[[], object] = lambda: None
+    ) -> int:
         """The finished map: its files are whole and on the disk then; the bytes of map.ply.
 
         A disk that is full is waited for, `PATIENCE` seconds; then the map goes to a folder for temporary files.
