@@ -187,7 +187,7 @@ def elsewhere(stages: Sequence[str], output: Output) -> str:
 def unfinished(output: Output) -> str:
     """Where the map so far is, and how to go on."""
     there = [name for name in ("map.ply", "trajectory.txt") if (output.path / name).exists()]
-    lines = [f"\nunfinished: the map so far is {output.path / 'map.ply'}" if "map.ply" in there else "\nno map yet"]
+    lines = [f"\nunfinished: the map so far is {output.path / 'map.ply'}" if "map.ply" in there else "\nno map there"]
     lines.append(
         f"go on with it: {output.resume}" if output.resume else f"nothing to go on with in {output.path}: run it again"
     )
