@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 _NARROWEST, _WIDEST = 1000.0, 0.01  # focal lengths as multiples of the longer side: 0.06 and 179 degrees of view
 FOCAL_RANGE = 0.05, 100.0  # of the longer side of an image without distortion: 170 degrees of view to half a degree
 _OFF_CENTER = 2.0  # image sizes from the middle: a principal point farther out is not even that of a cropped picture
+_SAME = 1e-3  # relative difference of intrinsics that is no other camera
 _LONGEST_SIDE = 2**20  # pixels
 CONTRAST, REST = 96, 0.98  # gray levels between the darkest and brightest of an image, without 1 % of it at each end
 BLACK, FLAT = 10, 4  # of an image that shows nothing: less bright, or with less contrast
@@ -54,6 +56,11 @@ def is_near_middle(intrinsics: np.ndarray, size: tuple[int, int]) -> bool:
     """Whether the principal point lies where that of an image (height, width) can; NaN does not."""
     off = np.abs(np.asarray(intrinsics, dtype=np.float64)[2:] - [0.5 * size[1], 0.5 * size[0]])
     return bool(np.all(off <= [_OFF_CENTER * size[1], _OFF_CENTER * size[0]]))
+
+
+def same_intrinsics(a: np.ndarray | Sequence[float], b: np.ndarray | Sequence[float]) -> bool:
+    """Whether both (4,) are those of one camera, but for what rounding and scaling leave."""
+    return bool(np.allclose(a, b, rtol=_SAME))
 
 
 def scale_intrinsics(intrinsics: np.ndarray, from_size: tuple[int, int], to_size: tuple[int, int]) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 
 from msgs import Frame
 from mvsgs_core.bad_file import BadFileError
+from mvsgs_core.camera import same_intrinsics
 from mvsgs_core.datasets.calibration import check_lens_option, lens_from_option
 from mvsgs_core.datasets.framing import Framing, same_shape
 from mvsgs_core.datasets.lens import Lens, Undistortion
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from nodes.ros2.dds import Reader
 
 UNSTAMPED = 1.0  # s for which images without a time stamp are left out: a simulation may have no clock yet
-SAME = 1e-3  # relative difference of intrinsics that is no other calibration
 POLL = 0.1  # s at most between two looks at the clock and at what was lost
 
 
@@ -220,7 +220,7 @@ class Ros2Camera(LiveSource):
             return
         theirs = lens.at(ours.size) if same_shape(ours.size, lens.size) else lens
         same_bend = (theirs.distortion, theirs.fisheye) == (ours.distortion, ours.fisheye)
-        if same_bend and not ours.guessed and np.allclose(theirs.intrinsics, ours.intrinsics, rtol=SAME):
+        if same_bend and not ours.guessed and same_intrinsics(theirs.intrinsics, ours.intrinsics):
             return
         self._warned_of_lens = True
         if ours.guessed:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from msgs import Frame
-from mvsgs_core.camera import FOCAL_RANGE, is_near_middle
+from mvsgs_core.camera import FOCAL_RANGE, is_near_middle, same_intrinsics
 from mvsgs_core.printable import printable
 from mvsgs_core.stats import Stats
 from mvsgs_core.stream_times import LATEST, StreamTimes
@@ -17,7 +17,6 @@ from mvsgs_core.stream_times import LATEST, StreamTimes
 MIN_SIDE, MAX_SIDE = 16, 16384  # pixels of a side
 CLOCKS_END = 2.0**31  # seconds: what ROS 2 can say
 BEHIND = 2.0  # s of delay that a user should know of
-SAME = 1e-3  # intrinsics that differ by less are those of one camera
 RUSHING = 100.0  # times as far as the time between two frames: stamps that advance so for `BRIEF` are no seconds
 BRIEF = 1.0  # s
 DRIFT = 5e-4  # that two clocks may run apart, one of them being set gently: 50 ppm alone make 2 s in 11 hours
@@ -76,7 +75,7 @@ class StreamFrames:
         """(4,): those of the first frame, whatever comes with later ones."""
         if self._intrinsics is None:
             self._intrinsics = frame.intrinsics.copy()  # a view would keep the whole frame
-        elif not np.allclose(frame.intrinsics, self._intrinsics, rtol=SAME):
+        elif not same_intrinsics(frame.intrinsics, self._intrinsics):
             self._stats.count("other_intrinsics")
             self._stats.warn(
                 f"{self._sender}'s intrinsics change between frames: those of the first are used for all; after a "

@@ -137,7 +137,7 @@ def _with_neighbors(records: list[FrameRecord], indices: Set[int]) -> list[Frame
         after = n + 1
         while after < len(records) and records[after].same_as == records[n].index:
             after += 1
-        near |= set(range(max(n - 1, 0), min(after + 1, len(records))))
+        near |= {max(n - 1, 0), n, after - 1, min(after, len(records) - 1)}  # a rest may be long
     near |= {place(origin) for origin in (records[n].same_as for n in near) if origin is not None}
     return [records[n] for n in sorted(near)]
 

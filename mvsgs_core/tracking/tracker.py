@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mvsgs_core.camera import scale_intrinsics
+from mvsgs_core.camera import same_intrinsics, scale_intrinsics
 from mvsgs_core.devices import resolve_device
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.kept_map import NOTHING_MAPPED
@@ -38,7 +38,6 @@ NOT_FOUND = (
     "the camera was not found at once in the map to go on in: a part of its own was begun, which is joined to it where "
     "the camera comes by"
 )
-SAME = 1e-3  # intrinsics that differ by less are those of one camera
 SPARED = "keyframes, about: farther apart, as the tracker took more than its share of time"
 
 
@@ -126,7 +125,7 @@ class Tracker:
         """(4,) that the pose of a frame (height, width) is found with, but for the focal factor: those that came with
         it, `came`, where they are the first frame's; else the first frame's."""
         ours = scale_intrinsics(self.session.intrinsics, self.session.size, size)
-        return came if np.allclose(came, ours, rtol=SAME) else ours
+        return came if same_intrinsics(came, ours) else ours
 
     def keyframe(self, index: int) -> Keyframe:
         return self.session.graph.keyframes[index]

@@ -106,12 +106,14 @@ class Checkpointing:
     def _elsewhere(self, atlas: Atlas, source: SourceCamera | None, error: OSError) -> str:
         """Writes the finished map to a folder for temporary files; what to say."""
         said = f"the finished map cannot be written to {self._output}: {error.strerror or error}"
-        folder = Path(tempfile.mkdtemp(prefix="mvsgs-map-"))
+        folder: Path | None = None
         try:
+            folder = Path(tempfile.mkdtemp(prefix="mvsgs-map-"))
             write_results(folder, atlas.current, source=source)
         except OSError as other:
-            shutil.rmtree(folder, ignore_errors=True)
-            return f"{said}; nor to {folder.parent}: {other.strerror or other}"
+            if folder is not None:
+                shutil.rmtree(folder, ignore_errors=True)
+            return f"{said}; nor to a folder for temporary files: {other.strerror or other}"
         return f"{said}; it is in {folder}"
 
     def close(self, atlas: Atlas, *, keep: bool) -> None:

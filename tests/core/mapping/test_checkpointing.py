@@ -192,6 +192,18 @@ def test_a_finished_map_that_finds_no_room_is_put_elsewhere(tmp_path: Path, monk
     assert len(read_ply(folder / "map.ply").splats) == len(atlas.current.state)
 
 
+def test_a_finished_map_that_finds_no_room_at_all_says_of_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    atlas = begun(PLAIN)
+    monkeypatch.setattr(checkpointing, "write_results", FullDisk(tmp_path, np.inf))
+    monkeypatch.setattr(checkpointing, "BETWEEN", 0.0)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
+    said = (
+        f"cannot be written to {tmp_path}: No space left on device; nor to a folder for temporary files: No such file"
+    )
+    with pytest.raises(OSError, match=said):
+        Checkpointing(tmp_path, 0.0, atlas, clock=Clock(1.0)).finish(atlas)
+
+
 def test_the_last_checkpoint_of_a_run_that_ends_early_is_there_at_once(tmp_path: Path) -> None:
     atlas = begun(PLAIN)
     checkpoints = Checkpointing(tmp_path, 30.0, atlas)
