@@ -133,6 +133,21 @@ def resize_image(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return np.asarray(resized)
 
 
+def resampled(image: np.ndarray, theirs: np.ndarray, ours: np.ndarray, *, nearest: bool = False) -> np.ndarray:
+    """(H, W) or (H, W, C) of a camera with intrinsics `theirs` (4,) as one with `ours` takes it from the same place.
+
+    Cubic, the border repeated; nearest: for depth and masks, no averages, and 0 where there is none.
+    """
+    zoom = np.asarray(theirs[:2]) / ours[:2]
+    shift = theirs[2:] - zoom * ours[2:]
+    theirs_from_ours = np.array([[zoom[0], 0.0, shift[0]], [0.0, zoom[1], shift[1]]])
+    how = cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC
+    border = cv2.BORDER_CONSTANT if nearest else cv2.BORDER_REPLICATE
+    size = image.shape[1], image.shape[0]
+    warped = cv2.warpAffine(image, theirs_from_ours, size, flags=how | cv2.WARP_INVERSE_MAP, borderMode=border)
+    return np.asarray(warped)
+
+
 def stretching(gray: np.ndarray, seen: np.ndarray | None = None) -> np.ndarray | None:
     """(256,) uint8: the gray levels of a dark or hazy image (H, W) uint8 spread, so that texture shows as in any other.
 

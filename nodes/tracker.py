@@ -64,7 +64,6 @@ class Tracker(TrackerNode):
         if self._returning is not None and frame.index <= self._returning.newest:
             self.stats.skip("frames that came again")
             return
-        self._newest = frame
         yield from super().on_frame(frame)
         if self.core.frozen:
             self._localized.add(frame, self.core.newest_pose())
@@ -186,6 +185,7 @@ class Tracker(TrackerNode):
         self._without_shutter.clear()
 
     def _add(self, frame: Frame) -> Update:
+        self._newest = frame
         return self.core.follow(
             frame.index, frame.timestamp, frame.image, frame.intrinsics, frame.intrinsics_guessed, frame.exposure,
             frame.mask, frame.original_intrinsics,

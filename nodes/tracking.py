@@ -21,6 +21,7 @@ from mvsgs_core.tracking.steps import Steps
 from mvsgs_core.trajectory import TrackingState
 from mvsgs_core.trajectory import Trajectory as CameraTrajectory
 from nodes import Node
+from nodes.one_camera import OneCamera
 
 POSE = "frame to pose"  # the latency
 PERIOD = 1.0  # s between two TrackerPhase of a live stream
@@ -76,6 +77,7 @@ class TrackerNode(Node, ABC):
 
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
+        self._camera = OneCamera()
         self._frames: dict[int, Frame] = {}  # those that may still be sent
         self._places: dict[int, np.ndarray] = {}  # by GPS, of the frames that have one
         self._revision = 0
@@ -113,7 +115,7 @@ class TrackerNode(Node, ABC):
         return False
 
     def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses | TrackedFrame | CameraPose | TrackerPhase]:
-        self._frames[frame.index] = frame
+        frame = self._frames[frame.index] = self._camera.frame(frame, self.stats)
         keep_place(self._places, frame)
         update = self._add(frame)
         if CameraPose not in self.unread and (pose := self._camera_pose(frame)) is not None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from msgs import GroundTruth, Trajectory
+from mvsgs_core.camera import resampled
 from mvsgs_core.datasets.lens import Lens, Undistortion
 from mvsgs_core.georeference import read_georeference
 from nodes.evaluator import Evaluator
@@ -132,6 +133,17 @@ def test_renders_are_compared_with_photographs_without_the_distortion_that_was_f
     np.testing.assert_allclose(scored.intrinsics, lens.intrinsics)
     assert lens.intrinsics[0] > 36.0  # zoomed in, so that no pixel is without a source
     evaluator.evaluation.close()
+
+
+def test_true_depth_is_scored_at_the_pixels_of_a_keyframe_that_was_resampled(evaluator: Evaluator) -> None:
+    """Depth that rises across the image of a camera whose middle has moved by five pixels."""
+    own, image = INTRINSICS * [0.9, 0.9, 1.0, 1.0] + [0.0, 0.0, 5.0, 2.0], np.zeros((H, W, 3), np.uint8)
+    depth = np.tile(np.arange(W, dtype=np.float32) + 40.0, (H, 1))
+    list(evaluator.on_ground_truth(GroundTruth(3, 0.1, image, own, None, depth)))
+    ours = resampled(depth, own, INTRINSICS, nearest=True)
+    assert ours[0, 0] == depth[0, round(own[2] - 0.9 * INTRINSICS[2])]
+    feed(evaluator)
+    np.testing.assert_array_equal(evaluator.evaluation._true_depth(3), ours)
 
 
 def test_gps_that_does_not_tell_is_said(evaluator: Evaluator) -> None:

@@ -11,9 +11,12 @@ import cv2
 import numpy as np
 import pytest
 
-from msgs import End, Frame, Keyframe, TrackedFrame
+from msgs import End, Frame, Keyframe, TrackedFrame, Trajectory
 from msgs.codec import NEWEST, encode
-from mvsgs_core.camera import scale_intrinsics
+from mvsgs_core.camera import resampled, scale_intrinsics
+from mvsgs_core.geometry import umeyama
+from mvsgs_core.stats import Stats
+from nodes.one_camera import OneCamera
 from nodes.robot import Robot
 from nodes.tracker import Tracker
 from tests.support.live_programs import received
@@ -23,18 +26,21 @@ from tests.support.shared_data import ROOT
 
 
 @pytest.mark.slow
-def test_intrinsics_that_change_are_sent_as_the_poses_are_found_with() -> None:
-    """Those of the first frame, in the pixels of an image that is larger."""
+def test_frames_whose_intrinsics_change_are_sent_as_one_camera_takes_them() -> None:
+    """As the first frame's, in the pixels of an image that is larger."""
     items, node = synthetic(frames=80)[:45], Tracker()
     first, size = items[0].intrinsics, (items[0].image.shape[0], items[0].image.shape[1])
     sent = []
     for item in items:
-        frame = Frame(item.index, item.timestamp, item.image, (1.0 if item.index < 20 else 1.5) * first)
+        own = first if item.index < 20 else first * [0.9, 0.9, 1.0, 1.0] + [0.0, 0.0, 4.0, -3.0]
+        image = resampled(item.image, first, own)
         if item.index >= 30:
-            frame = replace(frame, image=np.repeat(np.repeat(item.image, 2, axis=0), 2, axis=1))
-        sent += list(node.on_frame(frame))
+            image = np.repeat(np.repeat(image, 2, axis=0), 2, axis=1)
+        own = scale_intrinsics(own, size, (image.shape[0], image.shape[1]))
+        sent += list(node.on_frame(Frame(item.index, item.timestamp, image, own)))
     sent += list(node.on_end())
-    assert "the intrinsics change between frames: the tracker goes on with those of the first" in node.stats.warnings
+    assert node.stats.counts["frames resampled to the intrinsics of the first"] == 25
+    assert not any("intrinsics" in warning for warning in node.stats.warnings)
     for kind in (Keyframe, TrackedFrame):
         of_kind = [message for message in sent if isinstance(message, kind)]
         assert max(message.index for message in of_kind) >= 35
@@ -42,6 +48,32 @@ def test_intrinsics_that_change_are_sent_as_the_poses_are_found_with() -> None:
             ours = scale_intrinsics(first, size, (message.image.shape[0], message.image.shape[1]))
             np.testing.assert_allclose(message.intrinsics, ours, rtol=1e-9)
             assert message.index >= 20 or np.array_equal(message.intrinsics, first)  # as they came, to the bit
+            shown, taken = cv2.resize(message.image, size[::-1], interpolation=cv2.INTER_AREA), items[message.index]
+            assert np.abs(shown.astype(float) - taken.image).mean() < (0.1 if message.index < 20 else 4.0)
+    (trajectory,) = (message for message in sent if isinstance(message, Trajectory))
+    found, true = trajectory.world_from_cam[:, :3, 3], np.stack([item.world_from_cam[:3, 3] for item in items])
+    alignment = umeyama(found, true)
+    aligned = alignment.apply(found)
+    assert np.linalg.norm(aligned - true, axis=1).max() < 0.01 * np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
+
+
+def test_what_a_frame_does_not_show_of_the_first_frames_view_is_masked() -> None:
+    camera, stats = OneCamera(), Stats()
+    image, first = np.full((48, 64, 3), 90, np.uint8), np.array([50.0, 50.0, 31.5, 23.5])
+    frame = Frame(0, 0.0, image, first)
+    assert camera.frame(frame, stats) is frame
+    narrow = camera.frame(replace(frame, intrinsics=first * [2.0, 2.0, 1.0, 1.0]), stats)
+    assert narrow.mask is not None
+    rows, columns = np.nonzero(narrow.mask)
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (12, 35, 16, 47)
+    wide = camera.frame(replace(frame, intrinsics=first * [0.5, 0.5, 1.0, 1.0]), stats)
+    assert wide.mask is None
+    masked = camera.frame(replace(wide, intrinsics=frame.intrinsics * 0.5, mask=np.zeros((48, 64), bool)), stats)
+    assert masked.mask is not None
+    assert not masked.mask.any()
+    rounded = replace(frame, intrinsics=first * 1.0005)
+    assert camera.frame(rounded, stats) is rounded
+    assert stats.counts["frames resampled to the intrinsics of the first"] == 3
 
 
 @pytest.mark.slow

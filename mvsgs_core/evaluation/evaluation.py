@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mvsgs_core import geometry
-from mvsgs_core.camera import scale_intrinsics
+from mvsgs_core.camera import resampled, same_intrinsics, scale_intrinsics
 from mvsgs_core.evaluation import metrics, scoring, trajectory_metrics
 from mvsgs_core.evaluation.depth_metrics import NO_DEPTH, depth_ratios, score_depth
 from mvsgs_core.evaluation.exposure import frame_exposures, summary
@@ -210,15 +210,22 @@ class Evaluation:
         return Photograph(lambda: lens.image(given()), lens.intrinsics, True, straightened)
 
     def _true_depth(self, index: int) -> np.ndarray | None:
-        """(H, W) float32, 0 unknown, at the pixels of the keyframe: without the distortion that the tracker found."""
+        """(H, W) float32, 0 unknown, at the pixels of the keyframe: of its intrinsics, and without the distortion that
+        the tracker found."""
         known = self._frames.true_depth(index)
         if known is None:
             return None
         depth, intrinsics = known
-        if self.trajectory is None or self.trajectory.distortion is None:
+        if self.trajectory is None:
             return depth
         assert self.size is not None
         size = depth.shape[0], depth.shape[1]
+        if self.trajectory.distortion is None:
+            ours = self._frames.mapped_intrinsics(index) / [*2 * [self.trajectory.focal_factor], 1.0, 1.0]
+            if same_intrinsics(intrinsics, ours):
+                return depth
+            theirs, ours = (scale_intrinsics(each, self.size, size) for each in (intrinsics, ours))
+            return resampled(depth, theirs, ours, nearest=True)
         lens = undistortion(self.trajectory, scale_intrinsics(intrinsics, self.size, size), size)
         assert lens is not None
         return lens.depth(depth)

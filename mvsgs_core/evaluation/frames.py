@@ -118,6 +118,10 @@ class Frames:
             intrinsics = streamed.notes[index]
         return None if depth is None else (depth, intrinsics)
 
+    def mapped_intrinsics(self, index: int) -> np.ndarray:
+        """(4,) of a keyframe as it was mapped. Raises KeyError for one whose depth is not there."""
+        return self._mapped.notes[index].intrinsics
+
     def filtered_depths(self) -> Iterator[tuple[int, float]]:
         """Index and scale of the keyframes whose depth is there."""
         return ((index, mapped.scale) for index, mapped in sorted(self._mapped.notes.items()))
