@@ -38,7 +38,7 @@ class Settings:
     # tcp: the first of the ports, one a topic, best below 32768, from where on the system gives them to whoever
     # connects; null: free ones, known to nodes started here
     port: int | None = None
-    keys: str | None = None  # directory of CURVE keys: without them nothing listens beyond loopback
+    keys: str | None = None  # directory of CURVE keys: without them no topic is offered beyond loopback
     screen: Literal["auto", "live", "plain", "off"] = "auto"
     supervise: Supervise = field(default_factory=Supervise)
 

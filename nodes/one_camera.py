@@ -14,6 +14,8 @@ from msgs import Frame
 from mvsgs_core.camera import resampled, same_intrinsics, scale_intrinsics
 from mvsgs_core.stats import Stats
 
+FAR = 0.1  # relative difference of focal lengths that is no autofocus
+
 
 class OneCamera:
     """That of the first frame; its intrinsics follow an image's size."""
@@ -31,6 +33,11 @@ class OneCamera:
         if frame.intrinsics_guessed or same_intrinsics(frame.intrinsics, ours):
             return frame
         stats.count("frames resampled to the intrinsics of the first")
+        if not np.allclose(frame.intrinsics[:2], ours[:2], rtol=FAR):
+            stats.warn(
+                "the focal length changes while the stream runs, and each frame is taken as the first one's camera sees "
+                "it: what lies beyond that view is left out, and frames of a longer focal length show a part of it alone"
+            )
         image = resampled(frame.image, frame.intrinsics, ours)
         seen = np.ones(size, np.uint8) if frame.mask is None else frame.mask.astype(np.uint8)
         mask = resampled(seen, frame.intrinsics, ours, nearest=True).astype(bool)

@@ -24,6 +24,7 @@ class PhotographsTracker(TrackerNode):
     """Structure from motion of a set of photographs; everything leaves when the last one has come."""
 
     in_stream_order: ClassVar[bool] = False
+    one_camera: ClassVar[bool] = False
 
     @dataclass(frozen=True)
     class Config(PhotographsConfig):

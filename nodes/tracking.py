@@ -6,7 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -74,6 +74,7 @@ class TrackerNode(Node, ABC):
     """A subclass makes the tracker of the core, gives it frames and describes a keyframe."""
 
     core: CoreTracker
+    one_camera: ClassVar[bool] = True  # of all frames: what their intrinsics differ by is taken out of their images
 
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
@@ -115,7 +116,9 @@ class TrackerNode(Node, ABC):
         return False
 
     def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses | TrackedFrame | CameraPose | TrackerPhase]:
-        frame = self._frames[frame.index] = self._camera.frame(frame, self.stats)
+        if self.one_camera:
+            frame = self._camera.frame(frame, self.stats)
+        self._frames[frame.index] = frame
         keep_place(self._places, frame)
         update = self._add(frame)
         if CameraPose not in self.unread and (pose := self._camera_pose(frame)) is not None:

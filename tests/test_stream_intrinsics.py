@@ -17,6 +17,7 @@ from mvsgs_core.camera import resampled, scale_intrinsics
 from mvsgs_core.geometry import umeyama
 from mvsgs_core.stats import Stats
 from nodes.one_camera import OneCamera
+from nodes.photographs_tracker import PhotographsTracker
 from nodes.robot import Robot
 from nodes.tracker import Tracker
 from tests.support.live_programs import received
@@ -32,7 +33,7 @@ def test_frames_whose_intrinsics_change_are_sent_as_one_camera_takes_them() -> N
     first, size = items[0].intrinsics, (items[0].image.shape[0], items[0].image.shape[1])
     sent = []
     for item in items:
-        own = first if item.index < 20 else first * [0.9, 0.9, 1.0, 1.0] + [0.0, 0.0, 4.0, -3.0]
+        own = first if item.index < 20 else first * [0.95, 0.95, 1.0, 1.0] + [0.0, 0.0, 4.0, -3.0]
         image = resampled(item.image, first, own)
         if item.index >= 30:
             image = np.repeat(np.repeat(image, 2, axis=0), 2, axis=1)
@@ -74,6 +75,16 @@ def test_what_a_frame_does_not_show_of_the_first_frames_view_is_masked() -> None
     rounded = replace(frame, intrinsics=first * 1.0005)
     assert camera.frame(rounded, stats) is rounded
     assert stats.counts["frames resampled to the intrinsics of the first"] == 3
+    (said,) = stats.warnings
+    assert "the focal length changes while the stream runs" in said
+
+
+def test_photographs_keep_each_its_own_lens() -> None:
+    node, image, first = PhotographsTracker(), np.zeros((48, 64, 3), np.uint8), np.array([50.0, 50.0, 31.5, 23.5])
+    for index in range(2):
+        frame = Frame(index, 0.0, image, first * [1.0 + index, 1.0 + index, 1.0, 1.0])
+        list(node.on_frame(frame))
+        assert node._frames[index] is frame
 
 
 @pytest.mark.slow
