@@ -35,8 +35,8 @@ class OneCamera:
         stats.count("frames resampled to the intrinsics of the first")
         if not np.allclose(frame.intrinsics[:2], ours[:2], rtol=FAR):
             stats.warn(
-                "the focal length changes while the stream runs: each frame is taken as the first one's camera sees it, "
-                "what lies beyond that view is left out, and frames of a longer focal length show a part of it"
+                "the focal length changes while the stream runs: frames are taken as the first one's camera sees them; "
+                "what lies beyond that view is left out, and those of a longer focal length show a part of it"
             )
         image = resampled(frame.image, frame.intrinsics, ours)
         seen = np.ones(size, np.uint8) if frame.mask is None else frame.mask.astype(np.uint8)
