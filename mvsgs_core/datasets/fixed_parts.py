@@ -26,6 +26,8 @@ TURNS = 0.02  # of a thing's gradients, the second moment along its edges over t
 SMALLEST = 40  # pixels of one thing's edges
 MOST = 0.5  # of all edges: if more stay, the camera does, and something else moves
 DARK, NOISE = 40.0, 6.0  # gray levels of a bar: the most, and how much they differ
+BLACK = 16.0  # gray levels of a rim, the most: what an undistorted picture has where the lens saw nothing
+CONVEX = 0.97  # of the convex hull of what a rim leaves
 REACH = 4  # pixels between edges of one thing
 BESIDE, STILL = 12, 3.0  # pixels from a thing and the deviation in gray levels of what is still of it, without edges
 MARGIN = 3  # pixels beside what is fixed that show some of it
@@ -118,7 +120,7 @@ def fixed_in(edges: Edges) -> np.ndarray:
     fixed = _things(edges)
     fixed |= _cut_off(fixed, changes)
     fixed |= (changes < STILL) & (cv2.dilate(fixed.astype(np.uint8), _disk(BESIDE)) > 0)
-    fixed |= _bars(edges.pictures, fixed)
+    fixed |= _bars(edges.pictures, fixed) | _rim(edges.pictures)
     return np.asarray(cv2.dilate(fixed.astype(np.uint8), _disk(MARGIN)) > 0)
 
 
@@ -161,6 +163,22 @@ def _bars(stack: np.ndarray, fixed: np.ndarray) -> np.ndarray:
         if not whole.all() and min(first, last) >= 2 and abs(first - last) <= 2 + 0.1 * max(first, last):
             marked[:first] = marked[len(whole) - last :] = True
     return bars
+
+
+def _rim(stack: np.ndarray) -> np.ndarray:
+    """(h, w) bool: black that reaches two opposite sides and is bent, around a convex picture; it may have no edge that
+    stays, where what is behind it is dark at times."""
+    low, high = stack.min(axis=0), stack.max(axis=0)
+    black = (high < BLACK) & (high - low < NOISE)
+    _, labels = cv2.connectedComponents(np.pad(black, 1, constant_values=True).astype(np.uint8), connectivity=4)
+    rim = (labels == labels[0, 0])[1:-1, 1:-1]
+    opposite = (rim[0].any() and rim[-1].any()) or (rim[:, 0].any() and rim[:, -1].any())
+    rows, columns = np.nonzero(~rim)
+    if not opposite or not len(rows):
+        return np.zeros_like(rim)
+    hull = cv2.convexHull(np.stack([columns, rows], axis=1).astype(np.int32))
+    inside = cv2.fillConvexPoly(np.zeros(rim.shape, np.uint8), hull, 1)
+    return rim if len(rows) >= CONVEX * inside.sum() else np.zeros_like(rim)
 
 
 def _gradient(picture: np.ndarray) -> np.ndarray:

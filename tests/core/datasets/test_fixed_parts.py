@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mvsgs_core.datasets.fixed_parts import DOUBT, EVERY, WINDOW, FixedParts
-from tests.support.fixed_things import SIZE, WORLD, Draw, bars, frames, hood, logo, mirror, side_bars
+from mvsgs_core.datasets.fixed_parts import DOUBT, EVERY, WINDOW, FixedParts, _rim
+from tests.support.fixed_things import SIZE, WORLD, Draw, bars, frames, hood, logo, mirror, rim, side_bars
 
 
-@pytest.mark.parametrize("draw", [bars, side_bars, logo, hood, mirror])
+@pytest.mark.parametrize("draw", [bars, side_bars, logo, hood, mirror, rim])
 def test_it_is_found_and_hardly_more(draw: Draw) -> None:
     parts = FixedParts()
     for n, image in enumerate(frames(2 * EVERY)):
@@ -86,3 +86,15 @@ def test_pictures_of_another_size_begin_anew() -> None:
     parts.add(np.zeros((60, 80, 3), np.uint8))
     assert parts.mask is None
     assert not parts.judged
+
+
+def test_black_that_is_no_rim_is_of_the_scene() -> None:
+    """Before a black floor and a black wall, and between two posts that part the picture."""
+    for hide in (lambda y, x: y > 0.6 * x + 60, lambda y, x: (abs(x - 40) < 6) & (y > 20)):
+        parts = FixedParts()
+        y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+        for image in frames(2 * EVERY):
+            image[hide(y, x)] = 0
+            parts.add(image)
+        stack = np.stack(list(parts._pictures)) if parts._pictures else np.zeros((1, *SIZE))
+        assert not _rim(stack).any()
