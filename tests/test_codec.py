@@ -371,6 +371,20 @@ def test_the_documented_bytes_are_a_frame() -> None:
     assert data[:1] == NEWEST
 
 
+def test_all_arrays_that_may_be_left_out_are_named() -> None:
+    """Of each type, or of all keyframes, or of all that have an image."""
+    (listed,) = re.findall(r"an array whose default is `None` may be\sleft out \((.*?)\)\.", wire_document(), re.S)
+    named = [part.partition(" of ") for part in " ".join(listed.split()).split("; ")]
+    for kind in msgs.TYPES.values():
+        groups = {f"`{kind.__name__}`"} | (
+            {"keyframes"} if {f.name for f in fields(kind)} >= {"image", "world_from_cam", "scale"} else set()
+        )
+        groups |= {"every message with an image"} if "image" in {f.name for f in fields(kind)} else set()
+        for field in (f for f in fields(kind) if f.default is None):
+            of = [whose for names, _, whose in named if f"`{field.name}`" in names]
+            assert any(group in whose for whose in of for group in groups), (kind, field.name)
+
+
 def test_the_documented_program_writes_a_frame() -> None:
     (program,) = re.findall(r"```python\n(.*?)```", wire_document(), re.S)
     scope: dict[str, Any] = {}
