@@ -1,5 +1,6 @@
 #include "lucas_kanade.hpp"
 
+#include <algorithm>
 #include <cmath>
 
 #include "lanes.hpp"
@@ -9,6 +10,7 @@ namespace {
 
 constexpr int kWindow = 16;  // pixels; a row is one vector
 constexpr float kCenter = 7.5f;
+constexpr float kMostGain = 8.0f;  // of one image over the other
 
 inline vf splat_f(float x) { return vf{x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; }
 
@@ -42,46 +44,93 @@ bool sample(const Level& level, int border, float u, float v, Window& out) {
     return true;
 }
 
-// The window of `a` with its gradients, weighted and freed of their means: what a brightness offset can't move.
+// The window of `a` with its gradients, weighted and freed of their means and of what is proportional to the image:
+// what neither an offset nor a gain of the brightness can move.
 struct Template {
     Window image, gx, gy;
     float hxx, hxy, hyy;
+    float contrast;  // gray levels, weighted standard deviation
 };
 
 bool make_template(const Level& level, int border, float u, float v, const Window& weight, Template& t) {
     float fu, fv;
     const float* p = corner(level, border, u, v, 1, fu, fv);
     if (!p) return false;
-    vf left[kWindow + 3], middle[kWindow + 3], right[kWindow + 3];
+    vf rows[kWindow + 2], across[kWindow + 2];  // at (u, v), and the difference of the pixels beside it
     p -= level.stride;
+    vf middle{}, beside{};
     for (int r = 0; r < kWindow + 3; ++r, p += level.stride) {
         const vf a = load_f(p - 1), b = load_f(p), c = load_f(p + 1), d = load_f(p + 2);
-        left[r] = a + fu * (b - a);
-        middle[r] = b + fu * (c - b);
-        right[r] = c + fu * (d - c);
+        const vf next_middle = b + fu * (c - b), next_beside = c - a + fu * ((d - c) - (b - a));
+        if (r > 0) {
+            rows[r - 1] = middle + fv * (next_middle - middle);
+            across[r - 1] = beside + fv * (next_beside - beside);
+        }
+        middle = next_middle;
+        beside = next_beside;
     }
-    auto between = [&](const vf* rows, int r) { return rows[r] + fv * (rows[r + 1] - rows[r]); };
-    vf sum_x{}, sum_y{};
+    vf sum_x{}, sum_y{}, sum_1{}, sum_2{}, image_x{}, image_y{};
     for (int r = 0; r < kWindow; ++r) {
-        t.image.rows[r] = between(middle, r + 1);
-        t.gx.rows[r] = 0.5f * (between(right, r + 1) - between(left, r + 1));
-        t.gy.rows[r] = 0.5f * (between(middle, r + 2) - between(middle, r));
+        t.image.rows[r] = rows[r + 1];
+        t.gx.rows[r] = 0.5f * across[r + 1];
+        t.gy.rows[r] = 0.5f * (rows[r + 2] - rows[r]);
+        const vf weighted = weight.rows[r] * t.image.rows[r];
         sum_x += weight.rows[r] * t.gx.rows[r];
         sum_y += weight.rows[r] * t.gy.rows[r];
+        sum_1 += weighted;
+        sum_2 += weighted * t.image.rows[r];
+        image_x += weighted * t.gx.rows[r];
+        image_y += weighted * t.gy.rows[r];
     }
-    const vf mean_x = splat_f(sum(sum_x)), mean_y = splat_f(sum(sum_y));
+    const float mean_x = sum(sum_x), mean_y = sum(sum_y), mean = sum(sum_1);
+    const float variance = std::max(0.01f, sum(sum_2) - mean * mean);  // what sums of floats tell
+    const float share_x = (sum(image_x) - mean_x * mean) / variance;
+    const float share_y = (sum(image_y) - mean_y * mean) / variance;
+    const vf less_x = splat_f(mean_x - share_x * mean), less_y = splat_f(mean_y - share_y * mean);
     vf xx{}, xy{}, yy{};
     for (int r = 0; r < kWindow; ++r) {
-        const vf gx = t.gx.rows[r] - mean_x, gy = t.gy.rows[r] - mean_y;
+        const vf gx = t.gx.rows[r] - less_x - share_x * t.image.rows[r];
+        const vf gy = t.gy.rows[r] - less_y - share_y * t.image.rows[r];
         t.gx.rows[r] = weight.rows[r] * gx;
         t.gy.rows[r] = weight.rows[r] * gy;
         xx += t.gx.rows[r] * gx;
         xy += t.gx.rows[r] * gy;
         yy += t.gy.rows[r] * gy;
     }
+    t.contrast = std::sqrt(variance);
     t.hxx = sum(xx);
     t.hxy = sum(xy);
     t.hyy = sum(yy);
+    return true;
+}
+
+// The window of `level` around (u, v), times a template's gradients, summed up; its contrast, if asked for.
+template <bool kWithContrast>
+bool project(const Level& level, int border, float u, float v, const Template& t, const Window& weight, float& ex,
+             float& ey, float& contrast) {
+    float fu, fv;
+    const float* p = corner(level, border, u, v, 0, fu, fv);
+    if (!p) return false;
+    vf above = load_f(p) + fu * (load_f(p + 1) - load_f(p)), bx{}, by{}, sum_1{}, sum_2{};
+    for (int r = 0; r < kWindow; ++r) {
+        p += level.stride;
+        const vf below = load_f(p) + fu * (load_f(p + 1) - load_f(p));
+        const vf moved = above + fv * (below - above);
+        bx += t.gx.rows[r] * moved;
+        by += t.gy.rows[r] * moved;
+        if constexpr (kWithContrast) {
+            const vf weighted = weight.rows[r] * moved;
+            sum_1 += weighted;
+            sum_2 += weighted * moved;
+        }
+        above = below;
+    }
+    ex = sum(bx);
+    ey = sum(by);
+    if constexpr (kWithContrast) {
+        const float mean = sum(sum_1);
+        contrast = std::sqrt(std::max(0.0f, sum(sum_2) - mean * mean));
+    }
     return true;
 }
 
@@ -142,17 +191,15 @@ Tracked track_point(const Pyramid& a, const Pyramid& b, float u, float v, float 
         float x = du * scale, y = dv * scale;
         const float start_x = x, start_y = y, enough = l > 0 ? 0.05f : 0.01f;
         bool inside = true;
+        float size = det;  // times the gain of b over a: it makes steps shorter, and they end in the same place
         for (int n = 0; n < options.iterations; ++n) {
-            inside = sample(to, b.border, u * scale + x, v * scale + y, moved);
+            const float at_u = u * scale + x, at_v = v * scale + y;
+            float ex, ey, contrast = 0.0f;
+            inside = n == 0 ? project<true>(to, b.border, at_u, at_v, t, weight, ex, ey, contrast)
+                            : project<false>(to, b.border, at_u, at_v, t, weight, ex, ey, contrast);
             if (!inside) break;
-            vf bx{}, by{};
-            for (int r = 0; r < kWindow; ++r) {
-                const vf error = moved.rows[r] - t.image.rows[r];
-                bx += t.gx.rows[r] * error;
-                by += t.gy.rows[r] * error;
-            }
-            const float ex = sum(bx), ey = sum(by);
-            const float step_x = (t.hyy * ex - t.hxy * ey) / det, step_y = (t.hxx * ey - t.hxy * ex) / det;
+            if (n == 0) size = det * std::clamp(contrast / t.contrast, 1.0f / kMostGain, kMostGain);
+            const float step_x = (t.hyy * ex - t.hxy * ey) / size, step_y = (t.hxx * ey - t.hxy * ex) / size;
             x -= step_x;
             y -= step_y;
             if (std::fabs(x - start_x) > kWindow || std::fabs(y - start_y) > kWindow) inside = false;

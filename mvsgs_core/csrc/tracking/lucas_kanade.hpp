@@ -1,4 +1,4 @@
-// Pyramidal Lucas-Kanade, inverse compositional (Baker & Matthews 2004), with an unknown brightness offset.
+// Pyramidal Lucas-Kanade, inverse compositional (Baker & Matthews 2004), with an unknown gain and offset of brightness.
 #pragma once
 
 #include <vector>

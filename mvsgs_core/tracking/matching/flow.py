@@ -48,7 +48,8 @@ class Flow(Protocol):
 
 @dataclass
 class LucasKanade:
-    """Pyramidal Lucas-Kanade there and back; the weight falls with the distance from where it came."""
+    """Pyramidal Lucas-Kanade there and back, whatever the gain and offset of the brightness between both images; the
+    weight falls with the distance from where it came."""
 
     start_level: int = 2  # 0 is full size: the guess may be wrong by about 8 * 2^level pixels
     iterations: int = 10

@@ -30,9 +30,9 @@ def texture(seed: int = 0, sigma: float = 2.0) -> np.ndarray:
     return np.asarray(127.0 + 50.0 * image / image.std())
 
 
-def shifted(image: np.ndarray, du: float, dv: float, offset: float = 0.0) -> TrackingImage:
+def shifted(image: np.ndarray, du: float, dv: float, offset: float = 0.0, gain: float = 1.0) -> TrackingImage:
     matrix = np.array([[1.0, 0.0, du - 40.0], [0.0, 1.0, dv - 40.0]])
-    moved = cv2.warpAffine(image, matrix, (SIZE[1], SIZE[0]), flags=cv2.INTER_CUBIC) + offset
+    moved = gain * cv2.warpAffine(image, matrix, (SIZE[1], SIZE[0]), flags=cv2.INTER_CUBIC) + offset
     return TrackingImage(0, 0.0, np.clip(np.rint(moved), 0, 255).astype(np.uint8))
 
 
@@ -55,6 +55,18 @@ def test_a_brightness_offset_changes_nothing() -> None:
     error = np.linalg.norm(matches.target - points - (2.0, 1.0), axis=1)[matches.alive]
     assert matches.alive.mean() > 0.9
     assert np.median(error) < 0.05
+
+
+@pytest.mark.parametrize(("gains", "offset"), [((0.9, 0.27), 0.0), ((0.9, 0.45), 40.0), ((0.4, 1.0), 0.0)])
+def test_nor_does_a_gain(gains: tuple[float, float], offset: float) -> None:
+    """Of an exposure that jumps by more than a stop, brighter or darker."""
+    a, b = (shifted(texture(), 2.5 * k, 1.4 * k, k * offset, gain) for k, gain in enumerate(gains))
+    points = a.cells.points
+    matches = LucasKanade().match(a, b, points, points.astype(np.float64))
+    error = np.linalg.norm(matches.target - points - (2.5, 1.4), axis=1)[matches.alive]
+    assert matches.alive.mean() > 0.9
+    assert np.median(error) < 0.05
+    assert np.quantile(error, 0.95) < 0.2
 
 
 def test_another_image_is_not_found() -> None:
