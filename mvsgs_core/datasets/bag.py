@@ -5,20 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain, islice
-from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.datasets import Item, dataset
 from mvsgs_core.datasets.bag_file import is_bag_folder, messages, opened_bag
+from mvsgs_core.datasets.bag_lens import INFO, LensInTime, first_lens, info_topics
 from mvsgs_core.datasets.calibration import lens_from_option
 from mvsgs_core.datasets.cut_off_bag import CutOffBag
 from mvsgs_core.datasets.files import Layout
 from mvsgs_core.datasets.framing import same_shape
 from mvsgs_core.datasets.lens import Lens
-from mvsgs_core.datasets.ros import calibrated, lens_of, rectified, rgb_of
+from mvsgs_core.datasets.ros import rectified, rgb_of, seconds_of
 from mvsgs_core.datasets.sequence import FileReader, Notices
 from mvsgs_core.stream_times import LEAP, StreamTimes
 
@@ -34,8 +35,7 @@ LAYOUT = Layout(
 # That only bags have, .bag.active while one of ROS 1 is recorded; an .mcap file is one by its content, see mcap_file.
 _SUFFIXES = (".bag", ".active", ".db3")
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-_Picture = tuple[float, float, np.ndarray]  # seconds by the bag's clock and by the camera's, and RGB
-_INFO = "sensor_msgs/msg/CameraInfo"
+_Picture = tuple[float, float, np.ndarray, Lens]  # seconds by the bag's clock and by the camera's, and RGB
 _NOT_COLOR = ("depth", "infra", "disparity", "mask")
 
 
@@ -46,7 +46,7 @@ class Bag(FileReader):
     leap, as a clock that is set makes them, time goes on by the bag's own. A first one that is hours off is replaced.
 
     intrinsics (or "auto") and distortion replace its calibration; where there is none, or an empty one, the lens is the
-    guess of "auto", for the tracker to estimate.
+    guess of "auto", for the tracker to estimate. Where the calibration changes, each image has that of its time.
     Damaged messages are left out and counted. Raises ImportError without rosbags, FileNotFoundError and ValueError,
     which say what was expected, BadFileError for a bag that cannot be read or holds no image that can be.
     """
@@ -68,7 +68,9 @@ class Bag(FileReader):
             self._count = sum(c.msgcount for c in bag.connections if c.topic == self._topic)
             lens, native = None, _first_size(bag, self._topic)
             if self.intrinsics is None:
-                lens = _recorded_lens(bag, self._topic, self.info_topic, self._notices)
+                infos = info_topics(bag, self._topic, self.info_topic, self._notices)
+                lens = first_lens(bag, infos, rectified(self._topic), self._notices)
+            self._info_topic = None if lens is None else infos[0].topic
             if lens is None:
                 given = "auto" if self.intrinsics is None else self.intrinsics
                 lens, notes = lens_from_option(given, self.distortion, native)
@@ -83,7 +85,7 @@ class Bag(FileReader):
 
     @property
     def lens(self) -> Lens:
-        """Of the image as it is in the file."""
+        """Of the image as it is in the file, where its calibration does not change later."""
         return self._lens
 
     def __len__(self) -> int:
@@ -96,7 +98,7 @@ class Bag(FileReader):
         times = StreamTimes(lambda: received)
         with opened_bag(self._path, self._walked) as bag:
             for picture in self._with_first_time(self._pictures(bag)):
-                received, seconds, image = picture
+                received, seconds, image, lens = picture
                 repaired = times.repaired
                 shown = times.accept(seconds)
                 if shown is None:
@@ -106,16 +108,24 @@ class Bag(FileReader):
                 if times.repaired > repaired:
                     what = "places where time stamps stood still, went back or leapt: there the bag's times were taken"
                     self._notices.tally(what, f"at the stamp {seconds:.3f} s")
-                yield self._item(index, shown, image, seconds)
+                yield self._item(index, shown, image, seconds, lens)
                 index += 1
         self._end_places()
         if index == 0:
             raise BadFileError(f"no image of {self._topic} could be read: " + "; ".join(self.warnings))
 
     def _pictures(self, bag: OpenBag) -> Iterator[_Picture]:
+        """Each once the next has come, as the calibration at its stamp may come after it."""
         wanted = range(self._count)[self.wanted]
-        connections = [c for c in bag.connections if c.topic == self._topic]
-        for number, (connection, nanoseconds, data) in enumerate(messages(bag, connections, self._notices)):
+        infos = [c for c in bag.connections if (c.topic, c.msgtype) == (self._info_topic, INFO)]
+        topics = [*infos, *(c for c in bag.connections if c.topic == self._topic)]
+        lenses = LensInTime(self._lens, rectified(self._topic), self._notices)
+        number, last = -1, None
+        for connection, nanoseconds, data in messages(bag, topics, self._notices):
+            if connection.msgtype == INFO:
+                lenses.add(bag, nanoseconds, data)
+                continue
+            number += 1
             if number >= wanted.stop:
                 break
             if number not in wanted:
@@ -130,32 +140,41 @@ class Bag(FileReader):
                 what = "images left out because their calibration is for another aspect ratio"
                 self._notices.tally(what, f"{native} for {self._lens.size}")
                 continue
-            yield 1e-9 * nanoseconds, seconds, image
+            if last is not None:
+                yield *last, lenses.at(last[1])
+            last = 1e-9 * nanoseconds, seconds, image
+        if last is not None:
+            yield *last, lenses.at(last[1])
 
     def _with_first_time(self, pictures: Iterator[_Picture]) -> Iterator[_Picture]:
         """The same, the first at the time that the next two agree on, by the bag's, where its own is hours off."""
         first = list(islice(pictures, 3))
         if len(first) == 3:
-            ahead = [seconds - received for received, seconds, _ in first]
+            ahead = [seconds - received for received, seconds, *_ in first]
             if abs(ahead[0] - ahead[1]) > LEAP > abs(ahead[1] - ahead[2]):
-                received, seconds, image = first[0]
-                first[0] = received, received + ahead[1], image
+                received, seconds, image, lens = first[0]
+                first[0] = received, received + ahead[1], image, lens
                 self._notices.append(
                     f"the first time stamp, {seconds:.3f} s, is hours off those after it: it is taken to be "
                     f"{received + ahead[1]:.3f} s, by the bag's times"
                 )
         return chain(first, pictures)
 
-    def _item(self, index: int, seconds: float, image: np.ndarray, stamp: float) -> Item:
+    def _item(self, index: int, seconds: float, image: np.ndarray, stamp: float, original: Lens) -> Item:
         """stamp: by the camera's clock, as GPS has it, which the time in the stream may be off from."""
         native = image.shape[0], image.shape[1]
-        lens, size = self._lens.at(native), self._framing.size_of(self._lens.size)
+        lens, size = original.at(native), self._framing.size_of(self._lens.size)
         framed, intrinsics = self._framing.image(image, lens, size)
         mask = None if self._camera_mask is None else self._camera_mask.framed(self._framing, lens, size)
-        place, guessed = self._place(stamp), self._lens.guessed
-        original = np.array(self._lens.intrinsics, np.float64)
         return Item(
-            index, seconds, framed, intrinsics, intrinsics_guessed=guessed, place=place, mask=mask, original=original
+            index,
+            seconds,
+            framed,
+            intrinsics,
+            intrinsics_guessed=lens.guessed,
+            place=self._place(stamp),
+            mask=mask,
+            original=np.array(original.at(self._lens.size).intrinsics, np.float64),
         )
 
 
@@ -173,47 +192,20 @@ def _image_topic(bag: OpenBag, given: str | None) -> str:
     raise ValueError(f"the bag has several image topics; set dataset.options.topic to one of: {', '.join(topics)}")
 
 
-def _recorded_lens(bag: OpenBag, topic: str, given: str | None, notices: Notices) -> Lens | None:
-    """The lens of the camera_info beside the images, or of the topic `given`; None, said in `notices`, without one."""
-    topics = sorted({c.topic for c in bag.connections if c.msgtype == _INFO and c.msgcount})
-    if given is not None and given not in topics:
-        raise ValueError(f"the bag has no camera_info at {given}; it has it at: {', '.join(topics) or 'no topic'}")
-    beside = [str(parent / "camera_info") for parent in PurePosixPath(topic).parents]
-    chosen = next((t for t in ((given,) if given is not None else beside) if t in topics), None)
-    if chosen is None:
-        others = f", only at {', '.join(topics)} (dataset.options.info_topic chooses one)" if topics else ""
-        notices.append(f"no calibration: the bag has no camera_info for {topic}{others}")
-        return None
-    for _, _, data in messages(bag, [c for c in bag.connections if c.topic == chosen], notices):
-        with reading(chosen, "in the bag is no camera_info that can be used; set dataset.intrinsics=[fx,fy,cx,cy]"):
-            info = bag.deserialize(data, _INFO)
-            if calibrated(info):
-                return lens_of(info, rectified(topic))
-            break
-    notices.append(f"no calibration: {chosen} in the bag is empty, the camera was not calibrated")
-    return None
-
-
 def _first_size(bag: OpenBag, topic: str) -> tuple[int, int]:
-    ignored = Notices()  # reading the sequence reports it
-    for connection, _, data in messages(bag, [c for c in bag.connections if c.topic == topic], ignored):
+    found = Notices()  # reading the sequence reports it, where one can be read
+    for connection, _, data in messages(bag, [c for c in bag.connections if c.topic == topic], found):
         try:
             _, image = _picture(bag, connection, 0, data)
-        except BadFileError:
+        except BadFileError as error:
+            found.tally("images that could not be read", str(error))
             continue
         return image.shape[0], image.shape[1]
-    raise BadFileError(f"no image of {topic} can be read")
+    raise BadFileError(": ".join([f"no image of {topic} can be read", *found]))
 
 
 def _picture(bag: OpenBag, connection: BagTopic, nanoseconds: int, data: bytes) -> tuple[float, np.ndarray]:
     """Seconds and (H, W, 3) uint8 RGB of a message. Raises BadFileError for a damaged one."""
     with reading("a message", "cannot be read"):
         message = bag.deserialize(data, connection.msgtype)
-        return _seconds(message, nanoseconds), rgb_of(message)
-
-
-def _seconds(message: Any, nanoseconds: int) -> float:
-    """The header's time stamp, the bag's own where the header has none."""
-    stamp = message.header.stamp
-    seconds = stamp.sec + 1e-9 * stamp.nanosec
-    return float(seconds) if seconds > 0 else 1e-9 * nanoseconds
+        return seconds_of(message, nanoseconds), rgb_of(message)

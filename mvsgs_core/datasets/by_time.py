@@ -1,4 +1,5 @@
-"""Times of images: whether they ascend, and what was measured at other times, the nearest, and poses between two."""
+"""Times of images: whether they are any, and ascend; what was measured at other times, the nearest, and poses between
+two."""
 
 from __future__ import annotations
 
@@ -8,6 +9,14 @@ from itertools import pairwise
 import numpy as np
 
 from mvsgs_core.geometry import interpolate
+from mvsgs_core.trajectory_file import LATEST
+
+
+def check_times(frames: Sequence[tuple[float, str]]) -> None:
+    """Raises ValueError for the first of frames (seconds, name) that is at no time."""
+    for seconds, name in frames:
+        if not abs(seconds) < LATEST:
+            raise ValueError(f"{name} is at {seconds:g} s, which is no time: give each frame its own, in seconds")
 
 
 def standstill(frames: Sequence[tuple[float, str]]) -> list[str]:

@@ -63,12 +63,12 @@ class Euroc(ImageSequence):
         images = _read_list(LAYOUT.file(body / f"cam{self.camera}" / "data.csv"))
         if not images:
             raise LAYOUT.missing(f"{body / f'cam{self.camera}' / 'data.csv'} lists no image")
-        mounted = _mounted(body, self.camera)
+        given = None
         if self.intrinsics is not None:
-            lens = self._given_lens([image for _, image in images], self.intrinsics)
-        elif mounted is not None:
-            lens = mounted.lens
-        else:
+            given = self._given_lens([image for _, image in images], self.intrinsics)
+        mounted = _mounted(body, self.camera, given)
+        lens = given if mounted is None else mounted.lens
+        if lens is None:
             raise LAYOUT.missing(
                 f"{body / f'cam{self.camera}' / 'sensor.yaml'} is missing: copy it, or set dataset.intrinsics and "
                 "dataset.distortion"
@@ -136,8 +136,9 @@ def _read_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.array(times, dtype=np.float64), poses
 
 
-def _mounted(body: Path, camera: int) -> Mounted | None:
-    """As sensor.yaml or camchain.yaml has it; None where there is neither. Raises BadFileError."""
+def _mounted(body: Path, camera: int, given: Lens | None) -> Mounted | None:
+    """As sensor.yaml or camchain.yaml has it, with the lens that was given instead of theirs, which then is not read;
+    None where there is neither file. Raises BadFileError."""
     name = f"cam{camera}"
     kalibr = body.resolve().parent / "dso" / "camchain.yaml"
     for path, read in ((body / name / "sensor.yaml", _sensor), (kalibr, _chained)):
@@ -146,32 +147,30 @@ def _mounted(body: Path, camera: int) -> Mounted | None:
                 lines = path.read_text(encoding="utf-8-sig").splitlines()
                 text = "\n".join(line for line in lines if not line.startswith("%"))  # OpenCV's header is no YAML
                 content = OmegaConf.to_container(OmegaConf.create(text))
-                return read(content, name)
+                return read(content, name, given)
     return None
 
 
-def _sensor(content: Any, name: str) -> Mounted:
-    coefficients = content.get("distortion_coefficients", ())
-    size = int(content["resolution"][1]), int(content["resolution"][0])
-    lens = _lens(content, content["intrinsics"], size, coefficients)
+def _sensor(content: Any, name: str, given: Lens | None) -> Mounted:
+    lens = given or _lens(content, content.get("distortion_coefficients", ()))
     pose = np.array([float(v) for v in content["T_BS"]["data"]]).reshape(4, 4)
     return Mounted(lens, rigid(pose, "T_BS"))
 
 
-def _chained(content: Any, name: str) -> Mounted:
+def _chained(content: Any, name: str, given: Lens | None) -> Mounted:
     """Kalibr's."""
     camera = content[name]
-    size = int(camera["resolution"][1]), int(camera["resolution"][0])
-    lens = _lens(camera, camera["intrinsics"], size, camera["distortion_coeffs"])
+    lens = given or _lens(camera, camera["distortion_coeffs"])
     return Mounted(lens, inverse(rigid(np.array(camera["T_cam_imu"], dtype=np.float64), "T_cam_imu")))
 
 
-def _lens(camera: Mapping[str, Any], intrinsics: Any, size: tuple[int, int], coefficients: Any) -> Lens:
+def _lens(camera: Mapping[str, Any], coefficients: Any) -> Lens:
     model, distortion = camera["camera_model"], camera["distortion_model"]
     if model != "pinhole" or distortion not in (*_MODELS, "none"):
         raise ValueError(
             f"a {model} camera with {distortion} distortion is not read: set dataset.intrinsics and dataset.distortion"
         )
-    fx, fy, cx, cy = (float(v) for v in intrinsics)
+    fx, fy, cx, cy = (float(v) for v in camera["intrinsics"])
+    size = int(camera["resolution"][1]), int(camera["resolution"][0])
     bends = () if distortion == "none" else tuple(float(v) for v in coefficients)
     return Lens((fx, fy, cx, cy), size, bends, fisheye=_MODELS.get(distortion, False))

@@ -153,12 +153,18 @@ def is_turned(image: Image.Image) -> bool:
 def read_depth(path: Path, per_unit: float, invalid: tuple[int, ...] = (0,)) -> np.ndarray:
     """(H, W) float32 depth of an integer image where `per_unit` counts are one unit; `invalid` counts become 0.
 
-    Raises UnreadableImageError.
+    Raises UnreadableImageError, for counts of 8 bits and for fractions too, which count by another unit.
     """
     with opened_image(path, path.name) as opened:
         counts = np.asarray(opened)
     if counts.ndim != 2:
         raise UnreadableImageError(f"{path.name}: a depth map has one channel, this one is {counts.shape}")
+    if counts.dtype.kind not in "iu" or counts.dtype.itemsize < 2:
+        found = "fractions" if counts.dtype.kind == "f" else "8 bits"
+        raise UnreadableImageError(
+            f"{path.name}: a depth map has counts of 16 bits, {per_unit:g} of them a unit of the poses, and this one "
+            f"has {found}: convert all to such counts"
+        )
     depth = (counts / per_unit).astype(np.float32)
     depth[np.isin(counts, invalid) | ~(depth > 0) | np.isinf(depth)] = 0.0
     return depth
@@ -186,6 +192,22 @@ def read_numbers(path: Path) -> np.ndarray:
     """
     with reading(path, "must hold numbers and nothing else"):
         return np.array([float(v) for v in path.read_text(encoding="utf-8-sig").split()])
+
+
+def read_rows(path: Path, counts: Sequence[int], what: str) -> np.ndarray:
+    """(N, one of `counts`) float64: the numbers of each line of a text file that is not empty, as in `read_numbers`.
+
+    Raises BadFileError, which says `what` they are, for a line of more or fewer.
+    """
+    with reading(path, "must hold numbers and nothing else"):
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        rows = {number: [float(v) for v in line.split()] for number, line in enumerate(lines, start=1) if line.strip()}
+    first = len(next(iter(rows.values()), ()))
+    count = first if first in counts else counts[0]
+    for number, row in rows.items():
+        if len(row) != count:
+            raise BadFileError(f"{path}: a line must be {count} numbers, {what}; line {number} has {len(row)}")
+    return np.array(list(rows.values()), dtype=np.float64).reshape(-1, count)
 
 
 def visible(folder: Path, pattern: str) -> list[Path]:

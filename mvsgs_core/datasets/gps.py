@@ -8,6 +8,7 @@ none, and neither is (0, 0), which receivers write without a fix.
 from __future__ import annotations
 
 import csv
+import math
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -234,10 +235,14 @@ def _csv(text: str) -> Iterator[_Entry]:
 
 
 def _seconds(text: str) -> float:
+    """Of the stream or since 1970. Raises ValueError for what is neither a number nor ISO 8601, and for NaN."""
     try:
-        return float(text)
+        seconds = float(text)
     except ValueError:
         return clock_time(text)
+    if not math.isfinite(seconds):
+        raise ValueError(f"{text} is no time")
+    return seconds
 
 
 def _gpx(text: str) -> Iterator[_Entry]:
@@ -249,12 +254,16 @@ def _gpx(text: str) -> Iterator[_Entry]:
     points = found.get("trkpt") or [*found.get("wpt", []), *found.get("rtept", [])]  # beside a track they are marks
     for number, point in enumerate(points, start=1):
         inner = {child.tag.rpartition("}")[2]: (child.text or "").strip() for child in point}
-        by = inner.get("time") or inner.get("name")
-        if not by:
+        by: str | float
+        if time := inner.get("time"):
+            by = clock_time(time)
+        elif name := inner.get("name"):
+            by = name.replace("\\", "/").lower()
+        else:
             raise ValueError(f"point {number} has neither time nor name")
         ele = inner.get("ele")
         place = np.array([float(point.get("lat", "")), float(point.get("lon", "")), float(ele)]) if ele else None
-        yield clock_time(by) if "time" in inner else by.replace("\\", "/").lower(), _checked(place, f"point {number}")
+        yield by, _checked(place, f"point {number}")
 
 
 def _srt(text: str) -> Iterator[_Entry]:

@@ -11,10 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets import dataset
 from mvsgs_core.datasets.calibration import exif_notices, image_size, lens_from_option, with_distortion
-from mvsgs_core.datasets.colmap import find_colmap, models_beside, read_colmap
+from mvsgs_core.datasets.colmap import find_colmap
 from mvsgs_core.datasets.exif import exif_doubt, read_exif_exposure, read_exif_lens, read_exif_place, read_exif_time
 from mvsgs_core.datasets.files import (
     IMAGE_SUFFIXES,
@@ -26,15 +25,14 @@ from mvsgs_core.datasets.files import (
     natural_order,
     opened_image,
 )
+from mvsgs_core.datasets.find_model import RATE, SUBFOLDERS, find_model, records_of
 from mvsgs_core.datasets.framing import same_shape
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.masks import FOLDERS, masks_of
-from mvsgs_core.datasets.model import Model
-from mvsgs_core.datasets.phone_scans import find_record3d, polycam_folders, read_polycam, read_record3d
-from mvsgs_core.datasets.scannetpp import read_scannetpp, scannetpp_images
+from mvsgs_core.datasets.phone_scans import polycam_folders
+from mvsgs_core.datasets.scannetpp import scannetpp_images
 from mvsgs_core.datasets.sequence import Found, ImageSequence, Record
-from mvsgs_core.datasets.strecha import find_strecha, read_strecha
-from mvsgs_core.datasets.transforms import NAMES, find_transforms, read_transforms
+from mvsgs_core.datasets.transforms import NAMES, find_transforms
 from mvsgs_core.run_folder import has_settings
 
 LAYOUT = Layout(
@@ -45,7 +43,6 @@ LAYOUT = Layout(
     "under the images' names",
     "your own camera; frames of a video: ffmpeg -i video.mp4 -qscale:v 2 images/%05d.jpg (or dataset=video directly)",
 )
-_SUBFOLDERS = ("images", "rgb", "input", "frames")
 _LOOKED_AT = 1000  # images of which the header is read for their sizes, at most
 _MANY = 3  # times as many as beside such a subfolder: those are a preview, a plan, a logo
 
@@ -63,20 +60,20 @@ class Images(ImageSequence):
     """
 
     model: str | Path | None = None  # COLMAP model folder, transforms.json or folder of .camera files, if elsewhere
-    rate: float = 30.0  # images per second, for the timestamps
+    rate: float | None = None  # images per second, for the timestamps; null: as Record3D recorded them, else 30
 
     @staticmethod
     def recognizes(path: Path) -> bool:
         places = [place for place in _places(path) if place.is_dir()]
         if any(is_image(file) for place in places for file in place.iterdir()):
             return True
-        inside = path.absolute().name in _SUBFOLDERS  # with a folder of each camera in it
+        inside = path.absolute().name in SUBFOLDERS  # with a folder of each camera in it
         scene = path.absolute().parent if inside else path
-        subfolder = inside or any((path / name).is_dir() for name in _SUBFOLDERS)
+        subfolder = inside or any((path / name).is_dir() for name in SUBFOLDERS)
         return subfolder and (find_colmap(scene) is not None or find_transforms(scene) is not None)
 
     def _find(self) -> Found:
-        if self.rate <= 0:
+        if self.rate is not None and self.rate <= 0:
             raise ValueError(f"rate is a positive number of images per second, got {self.rate}")
         if self.intrinsics is not None and self.model is not None:
             raise ValueError("give intrinsics or model, not both: a model has its own intrinsics")
@@ -84,14 +81,14 @@ class Images(ImageSequence):
         images = _find_images(folder, self.warnings)
         sizes = _Sizes.of(images)
         model = (
-            None if self.intrinsics is not None else _find_model(folder, images, self.model, sizes.taken, self.warnings)
+            None if self.intrinsics is not None else find_model(folder, images, self.model, sizes.taken, self.warnings)
         )
         mask = None if self.mask is None else Path(self.mask).expanduser()
         one = mask is not None and mask.is_file()
         masks = [mask] * len(images) if one else masks_of(images, folder, mask)
         self._find_times(images)
         if model is not None:
-            records = _from_model(model, folder, images, self.rate, self.warnings)
+            records = records_of(model, folder, images, self.rate, self.warnings)
             known = dict(zip(images, masks))
             records = [replace(record, mask=record.mask or known[record.image]) for record in records]
             return Found(records, turn_upright=False, size=_Sizes.of([record.image for record in records]).taken)
@@ -106,7 +103,7 @@ class Images(ImageSequence):
             )
         size = sizes.shown(turn_upright)
         found = enumerate(zip(images, self._lenses(images, size, turn_upright), masks))
-        records = [Record(i / self.rate, image, lens, mask=mask) for i, (image, lens, mask) in found]
+        records = [Record(i / (self.rate or RATE), image, lens, mask=mask) for i, (image, lens, mask) in found]
         return Found(records, turn_upright=turn_upright, size=size)
 
     def _given_shapes(self, sizes: _Sizes, masks: dict[Path, Path | None]) -> list[tuple[float, float]]:
@@ -202,7 +199,7 @@ def _places(folder: Path) -> list[Path]:
     """Where the images may be; exports of an app come first, beside which it puts a picture of the whole."""
     polycam, scannetpp = polycam_folders(folder), scannetpp_images(folder)
     special = [polycam[0]] if polycam else [scannetpp] if scannetpp else []
-    return [*special, folder, *(folder / name for name in _SUBFOLDERS)]
+    return [*special, folder, *(folder / name for name in SUBFOLDERS)]
 
 
 def _find_images(folder: Path, notes: list[str]) -> list[Path]:
@@ -210,17 +207,17 @@ def _find_images(folder: Path, notes: list[str]) -> list[Path]:
     may lie; what is left out is told in `notes`."""
     found = {place: images for place in _places(folder) if place.is_dir() and (images := images_in(place))}
     place = next(iter(found), folder)
-    inner = next((inner for inner in found if inner.parent == folder and inner.name in _SUBFOLDERS), place)
+    inner = next((inner for inner in found if inner.parent == folder and inner.name in SUBFOLDERS), place)
     if place == folder and len(found.get(inner, ())) >= _MANY * len(found.get(folder, ())):
         place = inner
     if place in found:
         images, where = found[place], "directly in"
         left = [p for p in _below(place) if p.parent != place]
-        if place.parent == folder and place.name in _SUBFOLDERS:
+        if place.parent == folder and place.name in SUBFOLDERS:
             left += found.get(folder, [])
     else:
         where = "below"
-        for place in (*(folder / name for name in _SUBFOLDERS), folder):
+        for place in (*(folder / name for name in SUBFOLDERS), folder):
             if images := _below(place):
                 break
         left = [] if place == folder else [p for p in _below(folder) if not p.is_relative_to(place)]
@@ -327,73 +324,3 @@ def _of_other_shape(sizes: dict[Path, tuple[int, int]]) -> list[Path]:
     """Than the first."""
     first = next(iter(sizes.values()))
     return [path for path, size in sizes.items() if not same_shape(size, first)]
-
-
-def _find_model(
-    folder: Path, images: list[Path], given: str | Path | None, size: tuple[int, int], notes: list[str]
-) -> Model | None:
-    """size: (height, width) of the images on disk, for a model that does not say it."""
-    place = folder if given is None else Path(given).expanduser()
-    if given is not None and not place.exists():
-        raise FileNotFoundError(f"model {place} is missing: a folder with cameras and images of COLMAP, or {NAMES[0]}")
-    if given is None and (scannetpp := read_scannetpp(images[0].parent, size)) is not None:
-        return scannetpp
-    for base in dict.fromkeys([place, *_around(images[0])] if given is None else [place]):
-        transforms = base if base.is_file() else find_transforms(base, place.name)
-        colmap = find_colmap(base)
-        if colmap is not None:
-            return read_colmap(colmap) if colmap == base else _largest(colmap, notes)
-        if transforms is not None:
-            return read_transforms(transforms, size)
-        strecha = find_strecha(base)
-        if strecha is not None:
-            return read_strecha(strecha)
-        polycam = polycam_folders(base)
-        if polycam is not None:
-            return read_polycam(polycam[1])
-        record3d = find_record3d(base)
-        if record3d is not None:
-            return read_record3d(record3d)
-    if given is not None:
-        raise ValueError(f"model {place} is neither a COLMAP model, nor a {NAMES[0]}, nor a folder of .camera files")
-    return None
-
-
-def _largest(first: Path, notes: list[str]) -> Model:
-    """Of the COLMAP models that lie beside the first one, the one with most images, which need not be the first."""
-    models = {first: read_colmap(first)}
-    for other in models_beside(first):
-        with suppress(BadFileError):
-            models[other] = read_colmap(other)
-    best = max(models, key=lambda model: len(models[model].shots))
-    if len(models) > 1:
-        notes.append(
-            f"of {len(models)} COLMAP models in {first.parent}, which share no frame of reference, {best.name} is "
-            f"taken, as it knows most images: {len(models[best].shots)}; dataset.options.model=FOLDER takes another"
-        )
-    return models[best]
-
-
-def _around(image: Path) -> list[Path]:
-    """Folders above an image where its model may be: one more where each camera has a folder in images/."""
-    above = list(image.absolute().parents)
-    return above[: 3 if len(above) > 1 and above[1].name.partition("_")[0] in _SUBFOLDERS else 2]
-
-
-def _from_model(model: Model, folder: Path, images: list[Path], rate: float, notes: list[str]) -> list[Record]:
-    shots = model.lookup(images)
-    unknown = [image.name for image, shot in zip(images, shots) if shot is None]
-    if len(unknown) == len(images):
-        names, here = ", ".join(list(model.shots)[:3]), images[0].relative_to(folder).as_posix()
-        raise BadFileError(f"the {model.kind} knows none of the images: it names {names}, here is {here}")
-    common = model.common_lens
-    records = []
-    for i, (image, shot) in enumerate(zip(images, shots)):
-        if shot is not None:
-            records.append(Record(i / rate, image, shot.lens, shot.world_from_cam, mask=shot.mask))
-        elif common is not None:
-            records.append(Record(i / rate, image, common))
-    if unknown:
-        consequence = "they have no true pose" if common is not None else "left out, their camera is unknown"
-        notes.append(f"images that the {model.kind} does not know, {consequence}: {len(unknown)} (first: {unknown[0]})")
-    return records

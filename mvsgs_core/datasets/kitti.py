@@ -10,7 +10,7 @@ import numpy as np
 from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.datasets import dataset
 from mvsgs_core.datasets.calibration import image_size, size_doubt
-from mvsgs_core.datasets.files import Layout, numbered_images, read_numbers
+from mvsgs_core.datasets.files import Layout, numbered_images, read_numbers, read_rows
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import is_rigid
 from mvsgs_core.datasets.sequence import Found, ImageSequence, Record
@@ -84,11 +84,9 @@ class Kitti(ImageSequence):
         if path is None:
             self.warnings.append(f"{places[1]} is missing: the trajectory is not scored")
             return np.zeros((0, 4, 4))
-        values = read_numbers(path)
-        if values.size % 12:
-            raise BadFileError(f"{path}: a line must be 12 numbers, a 3x4 camera to world; there are {values.size}")
-        poses = np.tile(np.eye(4), (values.size // 12, 1, 1))
-        poses[:, :3] = values.reshape(-1, 3, 4)
+        lines = read_rows(path, (12,), "a 3x4 camera to world")
+        poses = np.tile(np.eye(4), (len(lines), 1, 1))
+        poses[:, :3] = lines.reshape(-1, 3, 4)
         return poses
 
 

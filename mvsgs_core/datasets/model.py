@@ -25,6 +25,7 @@ class Shot:
     lens: Lens
     world_from_cam: np.ndarray  # (4, 4) float64
     mask: Path | None = None  # that the model names
+    time: float | None = None  # seconds from the first image on, where the model says it
 
 
 @dataclass(frozen=True)
@@ -35,23 +36,28 @@ class Model:
     shots: Mapping[str, Shot]
 
     def lookup(self, images: list[Path]) -> list[Shot | None]:
-        """The shot of each image: by the longest end of its path that is a name, else by its bare name.
-
-        Names of a model start at another folder than ours, and some leave the suffix out. A shot is of one image: of
-        several that its name would suit, the one that it suits best has it, and of equals none.
-        """
-        names = _Names(self.shots)
-        found = [names.of(image.absolute()) for image in images]
-        counts = Counter(found)
-        best = dict(sorted(match for match in found if match is not None))
-        alone = [match is not None and counts[match] == 1 and best[match[0]] == match[1] for match in found]
-        return [self.shots[match[0]] if match is not None and has else None for match, has in zip(found, alone)]
+        """The shot of each image, of the name that is `matched` to it."""
+        return [None if name is None else self.shots[name] for name in matched(self.shots, images)]
 
     @property
     def common_lens(self) -> Lens | None:
         """The lens of all shots if they share one: it then holds for images without a pose too."""
         lenses = {shot.lens for shot in self.shots.values()}
         return lenses.pop() if len(lenses) == 1 else None
+
+
+def matched(names: Iterable[str], images: list[Path]) -> list[str | None]:
+    """Which of a model's names is each image's: by the longest end of its path that is a name, else by its bare name.
+
+    Names of a model start at another folder than ours, and some leave the suffix out. A name is of one image: of
+    several that it would suit, the one that it suits best has it, and of equals none.
+    """
+    known = _Names(names)
+    found = [known.of(image.absolute()) for image in images]
+    counts = Counter(found)
+    best = dict(sorted(match for match in found if match is not None))
+    alone = [match is not None and counts[match] == 1 and best[match[0]] == match[1] for match in found]
+    return [match[0] if match is not None and has else None for match, has in zip(found, alone)]
 
 
 _Fit = tuple[int, bool]  # parts of the path that are the whole name, 0 for a bare one; whether its suffix is the same

@@ -6,6 +6,7 @@ ARKit has OpenGL's camera axes, and counts pixels from the corner of the first o
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,7 @@ def read_record3d(path: Path) -> Model:
         size = int(content["h"]), int(content["w"])
         k = np.array(content["K"], dtype=np.float64).reshape(3, 3).T  # by columns
         common = [k[0, 0], k[1, 1], k[0, 2], k[1, 2]]
+        times = _times(content, len(content["poses"]))
         each = content.get("perFrameIntrinsicCoeffs") or [common] * len(content["poses"])
         if not len(images) <= len(content["poses"]) == len(each):
             raise ValueError(f"{len(images)} images, {len(content['poses'])} poses and {len(each)} cameras")
@@ -72,8 +74,23 @@ def read_record3d(path: Path) -> Model:
             pose[:3, :3] = rotation_from_quaternion(np.array([qw, qx, qy, qz]))
             pose[:3, 3] = position
             fx, fy, cx, cy = each[i]
-            shots[f"rgb/{image.name}"] = Shot(_lens(fx, fy, cx, cy, size), _opencv(pose))
+            shots[f"rgb/{image.name}"] = Shot(_lens(fx, fy, cx, cy, size), _opencv(pose), time=times[i])
     return Model("Record3D export", shots)
+
+
+def _times(content: Mapping[str, Any], frames: int) -> Sequence[float | None]:
+    """Seconds from Record3D's first frame on; None where it says neither times nor a rate. Raises ValueError."""
+    stamps, rate = content.get("frameTimestamps"), content.get("fps")
+    if stamps:
+        seconds = np.array(stamps, dtype=np.float64)
+        if seconds.shape != (frames,) or not np.all(np.isfinite(seconds)):
+            raise ValueError(f"frameTimestamps must be {frames} finite numbers, of each pose one")
+        return [float(v) for v in seconds - seconds[0]]
+    if rate is None:
+        return [None] * frames
+    if not 0.0 < float(rate) < np.inf:
+        raise ValueError(f"fps = {rate} is no number of images per second")
+    return [i / float(rate) for i in range(frames)]
 
 
 def _lens(fx: Any, fy: Any, cx: Any, cy: Any, size: tuple[int, int]) -> Lens:

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mvsgs_core.bad_file import BadFileError, reading
+from mvsgs_core.bad_file import reading
 from mvsgs_core.datasets import dataset
-from mvsgs_core.datasets.files import Layout, natural_order, read_numbers
+from mvsgs_core.datasets.files import Layout, natural_order, read_rows
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import is_rigid
 from mvsgs_core.datasets.sequence import DepthFormat, Found, ImageSequence, Record
@@ -76,9 +76,7 @@ def _poses(path: Path) -> tuple[list[np.ndarray | None], list[str]]:
     """world_from_cam by frame number, None where a line is no pose: not finite, or no rotation."""
     if not path.is_file():
         return [], [f"{path.name} is missing: the trajectory is not scored"]
-    values = read_numbers(path)
+    values = read_rows(path, (16, 4), "a 4x4 camera to world")
     if values.size == 0:
         return [], [f"{path.name} is empty: the trajectory is not scored"]
-    if values.size % 16:
-        raise BadFileError(f"{path}: a line must be 16 numbers, a 4x4 camera to world; there are {values.size} in all")
     return [pose if is_rigid(pose) else None for pose in values.reshape(-1, 4, 4)], []

@@ -22,6 +22,11 @@ _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
     "rgba8": (4, 8, cv2.COLOR_RGBA2RGB),
     "bgra8": (4, 8, cv2.COLOR_BGRA2RGB),
     "8UC3": (3, 8, cv2.COLOR_BGR2RGB),
+    "8UC4": (4, 8, cv2.COLOR_BGRA2RGB),
+    "rgb16": (3, 16, None),
+    "bgr16": (3, 16, cv2.COLOR_BGR2RGB),
+    "rgba16": (4, 16, cv2.COLOR_RGBA2RGB),
+    "bgra16": (4, 16, cv2.COLOR_BGRA2RGB),
     "mono8": (1, 8, cv2.COLOR_GRAY2RGB),
     "8UC1": (1, 8, cv2.COLOR_GRAY2RGB),
     "mono16": (1, 16, cv2.COLOR_GRAY2RGB),
@@ -30,6 +35,10 @@ _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
     "bayer_bggr8": (1, 8, cv2.COLOR_BayerRG2RGB),
     "bayer_gbrg8": (1, 8, cv2.COLOR_BayerGR2RGB),
     "bayer_grbg8": (1, 8, cv2.COLOR_BayerGB2RGB),
+    "bayer_rggb16": (1, 16, cv2.COLOR_BayerBG2RGB),
+    "bayer_bggr16": (1, 16, cv2.COLOR_BayerRG2RGB),
+    "bayer_gbrg16": (1, 16, cv2.COLOR_BayerGR2RGB),
+    "bayer_grbg16": (1, 16, cv2.COLOR_BayerGB2RGB),
     "yuv422": (2, 8, cv2.COLOR_YUV2RGB_UYVY),
     "uyvy": (2, 8, cv2.COLOR_YUV2RGB_UYVY),
     "yuv422_yuy2": (2, 8, cv2.COLOR_YUV2RGB_YUY2),
@@ -89,6 +98,13 @@ def _in_rgb(pixels: np.ndarray, encoding: str) -> np.ndarray:
     except cv2.error as error:  # a pattern of two by two pixels in an image of one row
         height, width = pixels.shape[:2]
         raise UnreadableImageError(f"a {width}x{height} image in {encoding}: {brief(error)}") from error
+
+
+def seconds_of(message: Any, nanoseconds: int) -> float:
+    """The time stamp of a message's header; that of who received it, in nanoseconds, where the header has none."""
+    stamp = message.header.stamp
+    seconds = stamp.sec + 1e-9 * stamp.nanosec
+    return float(seconds) if seconds > 0 else 1e-9 * nanoseconds
 
 
 def camera_info_topic(topic: str) -> str:

@@ -41,12 +41,14 @@ def scannetpp_images(folder: Path) -> Path | None:
     return None
 
 
-def read_scannetpp(images: Path, image_size: tuple[int, int]) -> Model | None:
-    """Cameras and poses of a folder of images, of those that are kept for tests too; None where it is none of
+def read_scannetpp(images: list[Path], image_size: tuple[int, int]) -> Model | None:
+    """Cameras and poses of images, of those that are kept for tests too; None where their folder is none of
     ScanNet++'s. Raises BadFileError for a malformed file."""
+    folder = images[0].parent
     for part in _PARTS:
-        if images.name == part.images and (path := _transforms(images, part)).is_file():
-            return Model("ScanNet++ model", read_transforms(path, image_size, masks=images.parent / part.masks).shots)
+        if folder.name == part.images and (path := _transforms(folder, part)).is_file():
+            model = read_transforms(path, images, image_size, masks=folder.parent / part.masks)
+            return Model("ScanNet++ model", model.shots)
     return None
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.datasets import Item
-from mvsgs_core.datasets.by_time import standstill
+from mvsgs_core.datasets.by_time import check_times, standstill
 from mvsgs_core.datasets.calibration import lens_for_images, with_distortion
 from mvsgs_core.datasets.files import UnreadableImageError, dark_16_bit, read_depth, read_image
 from mvsgs_core.datasets.framing import Framing, same_shape
@@ -154,13 +154,14 @@ class Found:
 class ImageSequence(FileReader, ABC):
     """Frames in files, read when asked for. A file that can't be read is left out with a warning, and it goes on.
 
-    Raises FileNotFoundError and ValueError, which say what was expected, ValueError where nothing is selected too, and
-    BadFileError while iterating where not one image can be read.
+    Raises FileNotFoundError and ValueError, which say what was expected, ValueError where nothing is selected and for a
+    frame at no time in seconds too, and BadFileError while iterating where not one image can be read.
     """
 
     def __post_init__(self) -> None:
         super().__post_init__()
         found = self._find()
+        check_times([(record.timestamp, record.image.name) for record in found.records])
         self.records = list(found.records)[self.wanted]
         if not self.records:
             count = len(found.records)

@@ -16,7 +16,7 @@ from mvsgs_core.datasets.files import (
     images_in,
     opened_image,
     read_array,
-    read_numbers,
+    read_rows,
 )
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.sequence import DepthFormat, Found, ImageSequence, Record
@@ -73,10 +73,10 @@ class TartanAir(ImageSequence):
         if not path.is_file():
             self.warnings.append(f"{path} is missing: the trajectory is not scored")
             return np.zeros((0, 4, 4))
-        values = read_numbers(path)
-        if values.size % 7 or not np.all(np.isfinite(values)):
-            raise BadFileError(f"{path}: a line must be 7 finite numbers, x y z qx qy qz qw; there are {values.size}")
-        lines = values.reshape(-1, 7)
+        lines = read_rows(path, (7,), "x y z qx qy qz qw")
+        finite = np.isfinite(lines).all(axis=1)
+        if not finite.all():
+            raise BadFileError(f"{path}: line {int(np.argmin(finite)) + 1} has a number that is not finite")
         length = np.linalg.norm(lines[:, 3:], axis=1)
         if np.any(np.abs(length - 1.0) > 1e-2):
             raise BadFileError(f"{path}: line {int(np.argmax(np.abs(length - 1.0) > 1e-2)) + 1} has no unit quaternion")

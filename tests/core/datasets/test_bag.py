@@ -198,6 +198,14 @@ def test_what_is_missing_is_said(tmp_path: Path, ros: Messages) -> None:
         ("bayer_bggr8", np.tile(np.array([[10, 90], [90, 200]], np.uint8), (HEIGHT // 2, WIDTH // 2)), (200, 90, 10)),
         ("bayer_grbg8", np.tile(np.array([[90, 200], [10, 90]], np.uint8), (HEIGHT // 2, WIDTH // 2)), (200, 90, 10)),
         ("bayer_gbrg8", np.tile(np.array([[90, 10], [200, 90]], np.uint8), (HEIGHT // 2, WIDTH // 2)), (200, 90, 10)),
+        ("8UC4", np.full((HEIGHT, WIDTH, 4), (1, 2, 3, 4), np.uint8), (3, 2, 1)),
+        ("rgb16", np.full((HEIGHT, WIDTH, 3), (256, 515, 1023), "<u2").view(np.uint8), (1, 2, 3)),
+        ("bgra16", np.full((HEIGHT, WIDTH, 4), (256, 515, 1023, 9), "<u2").view(np.uint8), (3, 2, 1)),
+        (
+            "bayer_grbg16",
+            np.tile(np.array([[90, 200], [10, 90]], "<u2") << 8, (HEIGHT // 2, WIDTH // 2)).view(np.uint8),
+            (200, 90, 10),
+        ),
         ("yuv422", np.tile(np.array([128, 77], np.uint8), (HEIGHT, WIDTH)), None),
         ("yuv422_yuy2", np.tile(np.array([77, 128], np.uint8), (HEIGHT, WIDTH)), None),
     ],
@@ -221,6 +229,53 @@ def test_encodings(encoding: str, data: np.ndarray, expected: tuple[int, int, in
 def test_damaged_or_unknown_images_are_refused(encoding: str, size: int) -> None:
     with pytest.raises(UnreadableImageError, match=r"no 32x24 image|no color or gray image"):
         rgb_of(Messages(2).image(0, encoding, np.zeros(size, np.uint8), 3 * WIDTH))
+
+
+def test_of_images_that_cannot_be_read_it_is_said_why(tmp_path: Path, ros: Messages) -> None:
+    counts = np.zeros(2 * HEIGHT * WIDTH, np.uint8)
+    deep = [("/c/image_raw", 1.0 + i, ros.image(i, "16UC1", counts, 2 * WIDTH)) for i in range(3)]
+    with pytest.raises(BadFileError, match=r"no image of /c/image_raw can be read: .*: 3 \(first: .*'16UC1' is no col"):
+        open_dataset("bag", path=ros.write(bag_path(tmp_path, ros), deep))
+
+
+def calibration(ros: Messages, seconds: float, focal: float, size: tuple[int, int] = (HEIGHT, WIDTH)) -> Any:
+    """Without distortion."""
+    info = ros.info()
+    info.header = ros.header(seconds)
+    info.height, info.width = size
+    (info.D if ros.ros == 1 else info.d)[:] = 0
+    matrix = info.K if ros.ros == 1 else info.k
+    matrix[0], matrix[4] = focal, focal and focal + 1
+    return info
+
+
+def test_each_image_has_the_calibration_of_its_time(tmp_path: Path, ros: Messages) -> None:
+    """Which comes before it or after it."""
+    messages = [("/c/image_raw", 1.0 + i, ros.image(i, "rgb8", picture(i), 3 * WIDTH)) for i in range(6)]
+    for i, (focal, late) in enumerate(zip((40, 40, 44, 44.01, 48, 48), (-0.1, 0.1, 0.1, 0.1, -0.8, 0.1))):
+        messages.append(("/c/camera_info", 1.0 + i + late, calibration(ros, 100 + i / 10, focal)))
+    messages.append(("/c/camera_info", 2.5, calibration(ros, 100.15, 0)))  # says nothing
+    messages.append(("/c/camera_info", 2.6, calibration(ros, 100.16, 30, (WIDTH, HEIGHT))))
+    sequence = open_dataset("bag", path=ros.write(bag_path(tmp_path, ros), sorted(messages, key=lambda m: m[1])))
+    for _ in range(2):
+        items = list(sequence)
+        assert [item.intrinsics[0] for item in items] == pytest.approx([40, 40, 44, 44, 48, 48])
+        assert [item.original[1] for item in items if item.original is not None] == pytest.approx(
+            [41, 41, 45, 45, 49, 49]
+        )
+        assert sequence.warnings == [
+            "calibrations left out because they are for another aspect ratio than the first: 1 (first: 24x32 for 32x24)"
+        ]
+    given = open_dataset("bag", path=bag_path(tmp_path, ros), intrinsics=[50, 50, 15.5, 11.5])
+    assert {item.intrinsics[0] for item in given} == {50.0}
+
+
+def test_the_first_calibration_that_says_anything_counts(tmp_path: Path, ros: Messages) -> None:
+    messages = [("/c/camera_info", 1.0 + i, calibration(ros, 100 + i / 10, 44 if i > 2 else 0)) for i in range(6)]
+    messages += [("/c/image_raw", 1.5 + i, ros.image(i, "rgb8", picture(i), 3 * WIDTH)) for i in range(6)]
+    sequence = open_dataset("bag", path=ros.write(bag_path(tmp_path, ros), sorted(messages, key=lambda m: m[1])))
+    assert [item.intrinsics[0] for item in sequence] == pytest.approx([44.0] * 6)
+    assert sequence.warnings == []
 
 
 def test_an_empty_calibration_is_a_guess(tmp_path: Path, ros: Messages) -> None:

@@ -233,3 +233,19 @@ def test_what_is_refused(tmp_path: Path, name: str, text: str, why: str) -> None
         read_gps(tmp_path / name)
     assert str(tmp_path / name) in str(error.value)
     assert why in str(error.value)
+
+
+@pytest.mark.parametrize("time", ["nan", "inf", "-inf"])
+def test_a_place_at_no_time_is_refused(time: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(f"time,lat,lon,alt\n0,47,8,1\n{time},47,8,1\n2,47,8,1\n")
+    with pytest.raises(BadFileError, match=rf"a\.csv .*line 3, .*: {time} is no time"):
+        read_gps(tmp_path / "a.csv")
+
+
+def test_a_point_of_gpx_with_an_empty_time_goes_by_its_name(tmp_path: Path) -> None:
+    points = '<wpt lat="47" lon="8"><ele>1</ele><time/><name>IMG_0.jpg</name></wpt>'
+    points += '<wpt lat="48" lon="8"><ele>1</ele><time>2026-05-01T12:00:00Z</time><name>IMG_1.jpg</name></wpt>'
+    (tmp_path / "a.gpx").write_text(f"<gpx>{points}</gpx>")
+    track = read_gps(tmp_path / "a.gpx")
+    assert [name for name, _ in track.named] == ["img_0.jpg"]
+    assert len(track.seconds) == 1

@@ -9,6 +9,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,11 @@ from mvsgs_core.datasets import check, open_dataset
 from mvsgs_core.datasets.calibration import image_size
 from mvsgs_core.datasets.compression import decompress
 from mvsgs_core.datasets.exif import read_exif_lens
-from mvsgs_core.datasets.files import UnreadableImageError, natural_order, read_image
+from mvsgs_core.datasets.files import UnreadableImageError, images_in, natural_order, read_image
+from mvsgs_core.datasets.lens import Lens
+from mvsgs_core.datasets.sequence import Found, ImageSequence, Record
 from tests.support.dataset_folders import colmap_text, huge_png, write_image, write_photos, write_replica, write_tum
+from tests.support.slam_folders import write_tartanair
 
 
 def test_a_huge_header_costs_its_image_and_no_more(tmp_path: Path) -> None:
@@ -57,15 +61,27 @@ def test_what_is_no_image_is_said_to_be_none(tmp_path: Path) -> None:
 
 
 def test_depth_that_is_no_number_is_unknown(tmp_path: Path) -> None:
-    folder = write_tum(tmp_path / "fr3", 1)
-    depth = np.full((48, 64), 5000.0, np.float32)
+    folder = write_tartanair(tmp_path, frames=1)  # whose depth has fractions
+    depth = np.full((48, 64), 1.0, np.float32)
     depth[0, :3] = np.nan, np.inf, -5000
-    (folder / "depth/0.png").unlink()
-    Image.fromarray(depth).save(folder / "depth/0.tiff")
-    (folder / "depth.txt").write_text("0.0 depth/0.tiff\n")
-    item = next(iter(open_dataset("tum", path=folder)))
+    np.save(folder / "depth_left/000000_left_depth.npy", depth)
+    item = next(iter(open_dataset("tartanair", path=folder)))
     assert item.depth is not None
     assert item.depth[0, :4].tolist() == [0, 0, 0, 1]
+
+
+@pytest.mark.parametrize("time", [float("nan"), float("inf"), -1e12])
+def test_a_reader_whose_frames_are_at_no_time_is_refused(time: float, tmp_path: Path) -> None:
+    @dataclass(kw_only=True, eq=False)
+    class Recorder(ImageSequence):
+        def _find(self) -> Found:
+            images = images_in(tmp_path)
+            lens = self._lens(images, Lens((50.0, 50.0, 31.5, 23.5), (48, 64)))
+            return Found([Record(seconds, image, lens) for seconds, image in zip((0.0, time), images)])
+
+    write_photos(tmp_path, 2)
+    with pytest.raises(ValueError, match=r"photo1\.png is at \S+ s, which is no time"):
+        Recorder(path=tmp_path)
 
 
 @pytest.mark.parametrize("listing", ["rgb.txt", "depth.txt"])

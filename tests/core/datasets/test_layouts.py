@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from mvsgs_core.datasets import formats, open_dataset
 from mvsgs_core.datasets.lens import Lens
@@ -17,6 +18,7 @@ from tests.support.dataset_folders import (
     write_image,
     write_replica,
     write_seven_scenes,
+    write_tum,
 )
 
 
@@ -48,9 +50,10 @@ def test_replica_without_all_its_poses(tmp_path: Path) -> None:
     assert sequence.warnings == ["traj.txt has no pose for 3 of 4 frames"]
     (folder / "traj.txt").write_text("")
     assert open_dataset("replica", path=folder).warnings == ["traj.txt is empty: the trajectory is not scored"]
-    (folder / "traj.txt").write_text("1 2 3")
-    with pytest.raises(ValueError, match="16 numbers"):
-        open_dataset("replica", path=folder)
+    for bad in ("1 2 3", 4 * "1 0 0 0 0 1 0 0 0 0 1 0\n"):
+        (folder / "traj.txt").write_text(bad)
+        with pytest.raises(ValueError, match=r"16 numbers, a 4x4 camera to world; line 1 has (3|12)"):
+            open_dataset("replica", path=folder)
 
 
 def test_seven_scenes(tmp_path: Path) -> None:
@@ -144,6 +147,20 @@ def test_color_in_a_depth_folder_is_refused(tmp_path: Path) -> None:
     sequence = open_dataset("icl_nuim", path=folder)
     assert [item.depth is not None for item in sequence] == [True, False]
     assert any("a depth map has one channel" in w for w in sequence.warnings)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "found"),
+    [(np.full((48, 64), 2.0, np.float32), "fractions"), (np.full((48, 64), 200, np.uint8), "8 bits")],
+)
+def test_depth_in_another_unit_is_refused(pixels: np.ndarray, found: str, tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "fr3", 3)
+    Image.fromarray(pixels).save(folder / "depth/0.tiff")
+    listing = folder / "depth.txt"
+    listing.write_text(listing.read_text().replace("0.png", "0.tiff"))
+    sequence = open_dataset("tum", path=folder)
+    assert [item.depth is not None for item in sequence] == [False, False, True]
+    assert any(f"16 bits, 5000 of them a unit of the poses, and this one has {found}" in w for w in sequence.warnings)
 
 
 @pytest.mark.parametrize("name", sorted(set(formats()) - {"synthetic"}))

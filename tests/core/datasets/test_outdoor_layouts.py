@@ -108,6 +108,9 @@ def test_tartanair_with_less_and_with_damage(tmp_path: Path) -> None:
         poses.write_text(bad)
         with pytest.raises(BadFileError, match=r"pose_left\.txt"):
             open_dataset("tartanair", path=folder)
+    poses.write_text(7 * "0 0 -2 0 0 0 1 0\n")
+    with pytest.raises(BadFileError, match=r"7 numbers, x y z qx qy qz qw; line 1 has 8"):
+        open_dataset("tartanair", path=folder)
     poses.write_text(whole.splitlines()[0])
     assert open_dataset("tartanair", path=folder).warnings == ["2 of 3 images have no true pose"]
     poses.unlink()

@@ -60,6 +60,27 @@ def test_corrected_cameras_come_first(tmp_path: Path) -> None:
     assert sequence.records[0].image.parent.name == "corrected_images"  # type: ignore[attr-defined]
 
 
+def test_record3d_says_when_its_frames_were_taken(tmp_path: Path) -> None:
+    _record3d(tmp_path)
+    file = tmp_path / "metadata.json"
+    content = json.loads(file.read_text())
+
+    def times(said: dict[str, object], **options: float) -> list[float]:
+        file.write_text(json.dumps({key: value for key, value in content.items() if key != "fps"} | said))
+        return [item.timestamp for item in open_dataset("images", path=tmp_path, **options)]
+
+    stamps: dict[str, object] = {"fps": 60, "frameTimestamps": [700.0, 700.5, 702.0]}
+    assert times(stamps) == [0.0, 0.5, 2.0]
+    assert times(stamps, rate=4.0) == [0.0, 0.25, 0.5]
+    assert times({"fps": 5}) == pytest.approx([0.0, 0.2, 0.4])
+    assert times({}) == pytest.approx([0.0, 1 / 30, 2 / 30])
+    (tmp_path / "rgb/1.jpg").unlink()
+    assert times(stamps) == [0.0, 2.0]
+    for wrong in ({"frameTimestamps": [1.0, 2.0]}, {"frameTimestamps": [1.0, np.nan, 2.0]}, {"fps": 0}):
+        with pytest.raises(BadFileError, match=r"metadata\.json .*(of each pose one|no number of images per second)"):
+            times(wrong)
+
+
 def test_damaged_exports(tmp_path: Path) -> None:
     _record3d(tmp_path / "a")
     content = json.loads((tmp_path / "a/metadata.json").read_text())

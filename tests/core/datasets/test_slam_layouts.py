@@ -90,6 +90,18 @@ def test_damaged_files_of_euroc_are_named(tmp_path: Path, damage: tuple[str, str
         open_dataset("euroc", path=folder)
 
 
+def test_the_given_lens_replaces_one_of_euroc_that_is_not_read(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path)
+    file = folder / "mav0/cam0/sensor.yaml"
+    file.write_text(file.read_text().replace("pinhole", "ds"))
+    with pytest.raises(BadFileError, match=r"set dataset\.intrinsics and dataset\.distortion"):
+        open_dataset("euroc", path=folder)
+    given = open_dataset("euroc", path=folder, intrinsics=[40, 40, 31.5, 23.5], distortion=["fisheye", 0.01, 0, 0, 0])
+    assert given.lens == Lens((40.0, 40.0, 31.5, 23.5), (48, 64), (0.01, 0.0, 0.0, 0.0), fisheye=True)
+    for i, item in enumerate(given):
+        np.testing.assert_allclose(item.world_from_cam, pose(i), atol=1e-5)
+
+
 @pytest.mark.parametrize(
     "change", [("pinhole", "omni"), ("radial-tangential", "fov"), ("T_BS", "T_SB"), ("1.0", ".nan")]
 )
@@ -141,7 +153,7 @@ def test_kitti_with_less(tmp_path: Path) -> None:
     [
         ("calib.txt", "P0: 1 2 3"), ("calib.txt", "P2: " + "nan " * 12), ("calib.txt", "P2: " + "1 " * 12),
         ("times.txt", "0 1 x"), ("times.txt", "0 2 1 3"), ("times.txt", "0 nan"), ("times.txt", "0 1 2"),
-        ("poses.txt", "1 2 3"),
+        ("poses.txt", "1 2 3"), ("poses.txt", 3 * ("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n")),
     ],
 )  # fmt: skip
 def test_damaged_files_of_kitti_are_named(tmp_path: Path, damage: tuple[str, str]) -> None:
