@@ -103,7 +103,7 @@ def _words(row: dict[str, Any]) -> dict[str, str]:
     """What a row says of both sides, by the word that stands for it. Raises ValueError where it says nothing."""
     if isinstance(row["value"], float):
         return {"kept": f"{row['value']:.2f}"}
-    images = _PROTOCOL.match(row["value"])
+    images = _PROTOCOL.match(row["value"] or "")
     if images is None:
         raise ValueError(f"{row['name']}: {row['value']!r} does not say what images both had")
     return {"ours": images[1], "theirs": images[2]}
@@ -126,8 +126,8 @@ def plots_of(rows: Rows) -> dict[str, str]:
     series = [
         svg.Series(
             way,
-            np.array([figures["seconds, frames to map"] for figures in methods.values()]),
-            np.array([figures["held-out PSNR"] for figures in methods.values()]),
+            np.array([figures["seconds, frames to map"] for figures in methods.values()], np.float64),
+            np.array([figures["held-out PSNR"] for figures in methods.values()], np.float64),
             points=True,
         )
         for way, methods in found.items()

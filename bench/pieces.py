@@ -11,13 +11,13 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from bench.runs import ROOT, Matrix, Run, commit, missing_data
-from bench.table import Row, is_failure, skipped
+from bench.table import Row, as_json, is_failure, skipped
 from mvsgs_core.atomic_file import replace_text
 
 
@@ -117,7 +117,7 @@ class Kept:
         rows = measured()
         if not any(map(is_failure, rows)):
             file.parent.mkdir(parents=True, exist_ok=True)
-            replace_text(file, json.dumps([asdict(row) for row in rows], indent=1))
+            replace_text(file, as_json(rows))
             self.keep(file, asked)
         return rows
 

@@ -87,7 +87,8 @@ class Record:
 
 
 def merge(runs: list[list[dict[str, Any]]]) -> list[dict[str, Any]]:
-    """Rows of repeated runs as one list: means and spreads of numbers, the last run's words; met if all runs met it."""
+    """Rows of repeated runs as one list: means and spreads of numbers, none where a run has none, the last run's words;
+    met if all runs met it."""
     found: dict[str, list[dict[str, Any]]] = {}
     for rows in runs:
         for row in rows:
@@ -101,6 +102,8 @@ def merge(runs: list[list[dict[str, Any]]]) -> list[dict[str, Any]]:
             spreads = [row.get("spread") or 0.0 for row in same]
             row["value"] = sum(numbers) / len(numbers)
             row["spread"] = (max(map(operator.add, numbers, spreads)) - min(map(operator.sub, numbers, spreads))) / 2
+        elif None in values:
+            row["value"] = row["spread"] = None
         met = [row["met"] for row in same if row["met"] is not None]
         row["met"] = all(met) if met else None
         merged.append(row)
@@ -134,10 +137,10 @@ def documents() -> list[Path]:
 
 
 def read_rows(files: Iterable[Path]) -> list[list[dict[str, Any]]]:
-    """Rows of each file. Raises ValueError for a file that holds no rows."""
+    """Rows of each file; what is NaN or infinite there is None. Raises ValueError for a file that holds no rows."""
     runs = []
     for file in files:
-        rows = json.loads(file.read_text())
+        rows = json.loads(file.read_text(), parse_constant=lambda name: None)
         if not isinstance(rows, list) or not all(isinstance(r, dict) and {"name", "value"} <= set(r) for r in rows):
             raise ValueError(f"{file}: no rows of a benchmark; they are written with --json FILE")
         runs.append([{**_UNSET, **row} for row in rows])

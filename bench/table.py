@@ -1,6 +1,7 @@
 """What every benchmark shares: rows, a table on the screen, `--json FILE`, `--quick`, names on its command line.
 
-FILE gets the rows, and FILE.origin beside it commit, machine and date of the measurement, which `bench.record` keeps.
+FILE gets the rows, with null for a number that is not finite, which JSON does not have, and FILE.origin beside it
+commit, machine and date of the measurement, which `bench.record` keeps.
 """
 
 from __future__ import annotations
@@ -158,10 +159,19 @@ def main(
     rows = measure(options)
     show(rows, title)
     if options.json:
-        options.json.write_text(json.dumps([asdict(row) for row in rows], indent=1))
+        options.json.write_text(as_json(rows))
         origin_of(options.json).write_text(json.dumps(made, indent=1))
     if any(map(is_failure, rows)):
         sys.exit(1)
+
+
+def as_json(rows: Iterable[Row]) -> str:
+    """Of a file of rows: a value or spread that is not finite is null."""
+    return json.dumps([{key: _finite(value) for key, value in asdict(row).items()} for row in rows], indent=1)
+
+
+def _finite(value: object) -> object:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def origin_of(file: Path) -> Path:

@@ -5,17 +5,21 @@
 
 Words at the end are settings as of the command line. `Mapping.add` takes as long as the map needs, so a thread of its
 own takes the camera's frames, and the loop always maps the newest: what came meanwhile is left out, and counted. A
-video is read at its own rate, as a camera would give it, or frame by frame with --every-frame.
+video is read at its own rate, as a camera would give it, or frame by frame with --every-frame. Ctrl-C leaves the camera
+and the map is finished and saved; a second one ends the program at once.
 """
 
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
@@ -28,12 +32,34 @@ except ModuleNotFoundError as error:
     sys.exit(f"error: {error}: run `make setup` once, then .venv/bin/python examples/camera_loop.py")
 
 
-class NewestFrame:
-    """The newest frame of an OpenCV capture, taken by a thread. Iterating ends where the camera does."""
+POLL = 0.2  # s between two looks at Ctrl-C while no frame comes
 
-    def __init__(self, capture: cv2.VideoCapture, rate: float | None) -> None:
+
+@contextmanager
+def ctrl_c() -> Iterator[threading.Event]:
+    """Set by Ctrl-C, to be looked at between two frames: an exception in the midst of `Mapping.add` would end the
+    stream before its map is finished. The second one ends the program at once."""
+    pressed = threading.Event()
+
+    def press(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        pressed.set()
+
+    before = signal.signal(signal.SIGINT, press)
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+class NewestFrame:
+    """The newest frame of an OpenCV capture, taken by a thread. Iterating ends where the camera does, or once `left` is
+    set."""
+
+    def __init__(self, capture: cv2.VideoCapture, rate: float | None, left: threading.Event | None = None) -> None:
         """rate: frames a second at which a file is read; None: as they come from a camera."""
         self.left_out = 0
+        self._left = left or threading.Event()
         self._capture, self._period = capture, 1.0 / rate if rate else 0.0
         self._changed = threading.Condition()
         self._newest: tuple[np.ndarray, float] | None = None
@@ -42,13 +68,14 @@ class NewestFrame:
 
     def __iter__(self) -> Iterator[tuple[np.ndarray, float]]:
         """(H, W, 3) RGB and seconds."""
-        while True:
+        while not self._left.is_set():
             with self._changed:
-                self._changed.wait_for(lambda: self._newest is not None or self._ended)
-                found, self._newest = self._newest, None
-            if found is None:
+                self._changed.wait_for(lambda: self._newest is not None or self._ended, POLL)
+                found, self._newest, ended = self._newest, None, self._ended
+            if found is not None:
+                yield cv2.cvtColor(found[0], cv2.COLOR_BGR2RGB), found[1]
+            elif ended:
                 return
-            yield cv2.cvtColor(found[0], cv2.COLOR_BGR2RGB), found[1]
 
     def _take(self) -> None:
         began, number = time.monotonic(), 0
@@ -66,10 +93,10 @@ class NewestFrame:
                 return
 
 
-def every_frame(capture: cv2.VideoCapture, rate: float) -> Iterator[tuple[np.ndarray, float]]:
-    """Of a file: none is left out, however long the map takes."""
+def every_frame(capture: cv2.VideoCapture, rate: float, left: threading.Event) -> Iterator[tuple[np.ndarray, float]]:
+    """Of a file, to its end or until `left` is set: none is left out, however long the map takes."""
     number = 0
-    while (found := capture.read())[0]:
+    while not left.is_set() and (found := capture.read())[0]:
         yield cv2.cvtColor(found[1], cv2.COLOR_BGR2RGB), number / rate
         number += 1
 
@@ -92,11 +119,11 @@ def main(words: list[str] | None = None) -> None:
     if not capture.isOpened():
         sys.exit(f"error: {options.video or options.camera} cannot be opened")
     rate = None if options.camera is not None else capture.get(cv2.CAP_PROP_FPS) or 30.0
-    newest = None if options.every_frame and rate else NewestFrame(capture, rate)
-    frames = newest or every_frame(capture, rate or 30.0)
     phase = ""
-    with Mapping(*options.settings, intrinsics=options.intrinsics) as mapping:
-        try:
+    with ctrl_c() as left:
+        newest = None if options.every_frame and rate else NewestFrame(capture, rate, left)
+        frames = newest or every_frame(capture, rate or 30.0, left)
+        with Mapping(*options.settings, intrinsics=options.intrinsics) as mapping:
             for image, seconds in frames:
                 tracked = mapping.add(image, seconds)
                 if tracked.phase != phase:
@@ -104,9 +131,9 @@ def main(words: list[str] | None = None) -> None:
                     print(f"{seconds:7.2f} s  {phase}")
                 for index in tracked.keyframes:
                     print(f"{seconds:7.2f} s  keyframe {index}")
-        except KeyboardInterrupt:
-            print("the camera is left; the map is finished")
-    print(f"{len(mapping.map)} splats; saved in {mapping.save(options.save)}")
+            if left.is_set():
+                print("the camera is left; the map is finished (Ctrl-C again: stop now)")
+        print(f"{len(mapping.map)} splats; saved in {mapping.save(options.save)}")
     if newest is not None:
         print(f"{newest.left_out} frames were left out while the map was at work")
     for warning in mapping.warnings:

@@ -15,6 +15,7 @@ from launch.settings_file import FILES
 from launch.specs import check_addresses
 from nodes.parameters import did_you_mean, located
 
+MOST_THREADS = 1024  # of a node: more than any machine has cores
 DEVICES = ("auto", "cpu", "cuda", "torch")  # torch: PyTorch on the CPU, in the place of C++
 
 
@@ -33,7 +34,10 @@ def check(graph: Graph) -> None:
     if not graph.settings.inline:
         check_addresses(graph)
         base_directory(graph)
-    _check_output(graph)
+    try:
+        _check_output(graph)
+    except OSError as error:
+        raise GraphError(f"output={graph.settings.output}: {error.strerror or error}") from error
 
 
 def _check_placement(slot: Slot) -> None:
@@ -44,8 +48,11 @@ def _check_placement(slot: Slot) -> None:
                 f"there are: {', '.join(msgs.TYPES)}"
             )
     for threads in (slot.placement.threads, slot.config.get("threads")):
-        if isinstance(threads, int) and threads < 1:
-            raise GraphError(f"{slot.name}.threads={threads}: must be 1 or more, or null for a share of the cores")
+        if isinstance(threads, int) and not 1 <= threads <= MOST_THREADS:
+            raise GraphError(
+                f"{slot.name}.threads={threads}: must be 1 or more, at most {MOST_THREADS}, or null for a share of the "
+                "cores"
+            )
     cores = slot.placement.cpu
     if cores is None or slot.placement.external or not hasattr(os, "sched_getaffinity"):
         return
@@ -58,7 +65,7 @@ def _check_placement(slot: Slot) -> None:
 
 
 def _check_output(graph: Graph) -> None:
-    """What is not of a run stays as it is, and what is read stays where it is."""
+    """What is not of a run stays as it is, and what is read stays where it is. Raises OSError for no folder's name."""
     output = Path(graph.settings.output)
     for name in graph.sources:
         for key in FILES:

@@ -290,6 +290,8 @@ def connect(slots: Mapping[str, Slot], known: Collection[str]) -> tuple[list[Edg
         for message in [m for m in inputs if m in slot.reads or m not in free]:
             senders = ", ".join(other for other, types in sends.items() if message in types)
             hint = f"set {name}.reads.{message.__name__} to one that does: {senders}" if senders else "no slot does"
+            if slot.placement.observer:
+                hint += f"; {name}=off runs without it"
             refusal = f"{name}: nobody sends {slot.target} a {message.__name__}"
             if message not in slot.reads:
                 raise GraphError(f"{refusal}: reads does not name the slot ({hint})")

@@ -11,10 +11,11 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import nodes
-from launch.graph import Graph
+from launch.graph import Graph, Slot
 from msgs import End, Message
+from msgs.codec import CodecError, check
 from nodes.runtime.requests import Pause
-from nodes.runtime.runner import Runner, end_of, seed
+from nodes.runtime.runner import Runner, end_of, exit_fails, seed
 
 POLL = 0.05  # s between two looks at what is asked, while the stream waits
 Observer = Callable[[str, nodes.Node, Any], None]
@@ -25,7 +26,7 @@ def run_inline(graph: Graph, observe: Observer | None = None) -> dict[str, nodes
 
     Every message goes all the way down before the next one starts, and a node's idle work is done to its end after
     each message. `observe(slot, node, message)` sees every message sent. An exception in a node passes through, after
-    every node's `on_abort`.
+    every node's `on_abort`. Raises CodecError for a message that differs from its annotations, as a process would.
     """
     seed(graph.settings.seed)
     run = InlineGraph(graph, observe)
@@ -45,7 +46,7 @@ class InlineGraph:
         """observe(slot, node, message) sees every message sent."""
         self._graph = graph
         self._observe = observe or (lambda slot, node, message: None)
-        self._runners = {name: Runner(name, slot.node(slot.parameters)) for name, slot in graph.slots.items()}
+        self._runners = {name: _runner(slot) for name, slot in graph.slots.items()}
         self._pauses = {name: Pause(self._runners[name].node) for name in graph.sources}
         self._asked: dict[str, list[Any]] = {}  # of each source, on its way there
 
@@ -81,7 +82,7 @@ class InlineGraph:
     def abort(self, reason: str) -> None:
         """Lets every node save what it has."""
         for runner in self._runners.values():
-            runner.node.on_abort(reason)
+            runner.abort(reason)
 
     def _ask(self, source: str, pause: Pause) -> None:
         """What came for a source since its last message goes out, and who asks may ask for more."""
@@ -93,6 +94,7 @@ class InlineGraph:
 
     def _send(self, sender: str, messages: Iterable[Message]) -> None:
         for message in messages:
+            _check(sender, message)
             self._observe(sender, self._runners[sender].node, message)
             for edge in self._graph.out_of(sender):
                 if edge.message is type(message) and edge.reader in self._pauses:  # in its place among the frames
@@ -109,3 +111,17 @@ class InlineGraph:
     def _end(self, name: str, runner: Runner) -> End:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024  # of all nodes together, here
         return end_of(name, runner.node, peak_bytes=peak, busy_seconds=runner.busy_seconds)
+
+
+def _runner(slot: Slot) -> Runner:
+    with exit_fails(slot.name):
+        node = slot.node(slot.parameters)
+    return Runner(slot.name, node)
+
+
+def _check(sender: str, message: Message) -> None:
+    """Raises CodecError, with the sender, for a message that no process could send."""
+    try:
+        check(message)
+    except CodecError as error:
+        raise CodecError(f"{sender}: {error}") from error

@@ -12,6 +12,7 @@ import os
 import shlex
 import shutil
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -27,6 +28,7 @@ from mvsgs_core.kept_map import FOLDER, TRACKER
 from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, checkpoint_info
 from mvsgs_core.passwords import without_passwords
 from mvsgs_core.run_folder import CONFIG, has_settings
+from mvsgs_core.shared_folder import HOME, refusal, shared
 
 LOCK, PREVIOUS, REPORT = ".lock", "previous", "report.json"
 FOUND = ("map.ply", "localization.csv")  # either, a checkpoint or a pose is worth keeping of an earlier run
@@ -46,10 +48,8 @@ class Output:
         than a run keep their files, or where another run is writing to it."""
         self.path, self._resumable = path, resumable
         self.resume: str | None = None  # the command that goes on with the run, once it has ended early
+        make_folder(path)
         try:
-            if found := file_in_the_way(path) or _of_all(path):
-                raise GraphError(f"output={path}: {found}")
-            path.mkdir(parents=True, exist_ok=True)
             self._lock = _lock(path / LOCK)
         except BlockingIOError as error:
             raise GraphError(
@@ -154,6 +154,18 @@ class Output:
         return f"{len(kept)} of them, " + (f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.0f} MB")
 
 
+def make_folder(path: Path) -> None:
+    """The folder that a run, or a sweep's runs, write in. Raises GraphError where it cannot be made or written in, and
+    where others than runs keep their files."""
+    try:
+        if found := file_in_the_way(path) or _of_all(path):
+            raise GraphError(f"output={path}: {found}")
+        path.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=path).close()  # leaves nothing
+    except OSError as error:
+        raise GraphError(f"output={path}: {error.strerror or error}") from error
+
+
 def file_in_the_way(folder: Path) -> str | None:
     """Why there can be no such folder, as a file is in its place, or in that of one above. Raises OSError."""
     for place in (folder, *folder.parents):
@@ -163,19 +175,11 @@ def file_in_the_way(folder: Path) -> str | None:
 
 
 def _of_all(folder: Path) -> str | None:
-    """Why a run's files are not to lie in that folder itself."""
-    home = os.path.expanduser("~")  # noqa: PTH111  # raises nothing where a user has none
-    if _same(folder, Path("/")):
-        what = "the root of the file system"
-    elif _same(folder, Path(home)) and not is_of_a_run(folder):
-        what = "your home folder"
-    else:
+    """Why a run's files are not to lie in that folder itself; in the home a run may go on that was begun there."""
+    what = shared(folder)
+    if what is None or (what == HOME and is_of_a_run(folder)):
         return None
-    return f"is {what}; a run needs a folder of its own, such as {folder / 'runs' / 'first'}"
-
-
-def _same(folder: Path, other: Path) -> bool:
-    return folder.exists() and other.exists() and folder.samefile(other)
+    return refusal(folder, what, "a run")
 
 
 def _resume_command(output: Path) -> str | None:

@@ -1,7 +1,8 @@
 """`resume=DIR`: the graph of an interrupted run, to go on in the same directory from its checkpoint.
 
 Where the sources can be read again, the whole graph runs from the stream's beginning, and passes over what the map has.
-Where they cannot (a live camera), the checkpoint's keyframes are the source, and what is left is to refine and score.
+Where they cannot (a live camera), or with dataset=resumed, the checkpoint's keyframes are the source, and what is left
+is to refine and score.
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ from yaml import YAMLError  # type: ignore[import-untyped]
 import msgs
 import nodes
 from launch.compose import CONF, choice_of, defaults_of, graph_of, parse, prepare
-from launch.graph import load_node
+from launch.graph import Graph, load_node
 from launch.output import REPORT, read_report
 from launch.refusal import GraphError
+from launch.same_stream import check_stream
 from launch.settings import BUFFER, FROM_SETTINGS, LIVE_BUFFER
 from mvsgs_core.mapping.checkpoints.files import CheckpointInfo, checkpoint_info
 from nodes.parameters import parameter_names
@@ -33,15 +35,18 @@ CHOICE = "resumed"
 def resumed_config(folder: Path, overrides: Sequence[str], conf: Path = CONF) -> DictConfig:
     """What runs to go on with the run in `folder`, with overrides as on any command line.
 
-    Raises GraphError where there is nothing to go on with.
+    Raises GraphError where there is nothing to go on with, and where the frames would be others than the map's.
     """
     folder = folder.expanduser().absolute()
     config = _moved(_interrupted(folder), folder)
-    info = _checkpoint(folder)
+    info, before = _checkpoint(folder), _graph(config)
     slots = defaults_of(conf)
     for text in sorted(prepare(overrides, conf), key=_of_one_slot):
         _apply(config, text, slots, conf)
-    if not all(node.replayable for node in _classes(config).values() if nodes.is_source(node)):
+    alone = f"{SOURCE}={CHOICE}" in overrides
+    if not alone:
+        check_stream(before, _graph(config))
+    if alone or not all(node.replayable for node in _classes(config).values() if nodes.is_source(node)):
         _without_stream(config, folder, conf)
     for slot, node in _classes(config).items():
         if not node.in_stream_order:
@@ -62,10 +67,7 @@ def leave_out_refused(config: DictConfig) -> list[str]:
 
     Raises GraphError for what no longer makes a graph, such as a parameter that this version does not have.
     """
-    try:
-        graph = graph_of(config, (), {})
-    except GraphError as error:
-        raise GraphError(f"{WORD}{config.output}: {error}") from error
+    graph = _graph(config)
     notes = []
     for name in graph.observers:
         slot = graph.slots[name]
@@ -79,9 +81,20 @@ def leave_out_refused(config: DictConfig) -> list[str]:
     return notes
 
 
+def _graph(config: DictConfig) -> Graph:
+    try:
+        return graph_of(config, (), {})
+    except GraphError as error:
+        raise GraphError(f"{WORD}{config.output}: {error}") from error
+
+
 def _interrupted(folder: Path) -> DictConfig:
     """The configuration of the run in that folder, which has not reached its end."""
-    if not folder.is_dir():
+    try:
+        there = folder.is_dir()
+    except OSError as error:  # no name of a directory
+        raise GraphError(f"{WORD}{folder}: {error.strerror or error}") from error
+    if not there:
         raise GraphError(f"{WORD}{folder}: no such directory; give the output directory of a run")
     file = folder / "config.yaml"
     try:

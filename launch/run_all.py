@@ -35,17 +35,17 @@ try:
     from launch.advice import advised
     from launch.children import python_environment
     from launch.comparison import comparison_page, comparison_text, has_figures
-    from launch.compose import CONF, choices_of, graph_of, in_grammar, prepare
+    from launch.compose import CONF, choices_of, graph_of, prepare
     from launch.graph_text import graph_text
     from launch.help_text import help_text
     from launch.jobs import Job, RunFailed, refused, run
     from launch.late_help import accept_late_help
-    from launch.named_input import SLOT, with_named_input
+    from launch.named_input import SLOT, quoted, with_named_input
     from launch.outcome import FAILED
     from launch.refusal import GraphError
     from launch.resume import WORD as RESUME
     from launch.resume import leave_out_refused, resumed_config
-    from launch.sweep import check_jobs, check_launcher, check_single, swept
+    from launch.sweep import check_jobs, check_launcher, check_single, made_folder, named_folder, swept
     from mvsgs_core.atomic_file import replace_text
     from mvsgs_core.printable import not_utf8
 except ModuleNotFoundError as error:
@@ -139,7 +139,10 @@ def resumed_job(arguments: Sequence[str]) -> Job:
 
 
 def hydra_arguments(arguments: Sequence[str]) -> list[str]:
-    """The command line as Hydra takes it. Raises GraphError for overrides that name nothing there is."""
+    """The command line as Hydra takes it; of a sweep the folder is made.
+
+    Raises GraphError for overrides that name nothing there is, and for a folder that cannot be made.
+    """
     words = ["inline=true" if word == "--inline" else word for word in arguments]
     conf = Path(_option(words, "--config-path", "-cp") or CONF).absolute()
     check_launcher(words)
@@ -152,10 +155,16 @@ def hydra_arguments(arguments: Sequence[str]) -> list[str]:
     else:
         if not elsewhere and not any(word.startswith(("hydra/", "--config-name", "-cn")) for word in words):
             check_jobs(overrides, conf)
-        # each job's output is a numbered directory in the one that was asked for
-        output = [in_grammar(text).partition("=")[2] for text in overrides if text.startswith("output=")]
-        prepared += [f"hydra.sweep.dir={folder}" for folder in output]
+        prepared += _sweep_folder(overrides, own=conf == CONF)
     return [word for word in words if word not in overrides] + prepared
+
+
+def _sweep_folder(overrides: Sequence[str], *, own: bool) -> list[str]:
+    """What tells Hydra where a sweep's jobs are numbered. own: the configuration is ours; others name a folder."""
+    named = named_folder(overrides)
+    if any(text.startswith("hydra.sweep.dir=") for text in overrides) or not (named or own):
+        return []
+    return [f"hydra.sweep.dir={quoted(str(made_folder(named)))}"]
 
 
 def _option(words: Sequence[str], *names: str) -> str | None:

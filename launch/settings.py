@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
-from mvsgs_core.setting_ranges import SEEDS, at_least, within
+from mvsgs_core.setting_ranges import SEEDS, UNBOUNDED, at_least, within
 
 BUFFER, LIVE_BUFFER = 4, 128  # messages: a live stage works off a burst, and holds nobody up meanwhile
 
@@ -28,7 +28,7 @@ class Settings:
     map: str | None = None  # output of a run with keep_map=true: its map is gone on with; null: a new map
     keep_map: bool | None = None  # leave the map in the output, for another run to begin on; null: where `map` is given
     device: str = "auto"  # auto, cpu, cuda or cuda:1: for every node that has a `device` and leaves it at auto
-    seed: int = 0  # of every random choice
+    seed: Annotated[int, UNBOUNDED] = 0  # of every random choice
     inline: bool = False  # true (or --inline): all nodes in this process, one message at a time, for a debugger
     # keep the camera's pace, at the price of detail: recordings too, at theirs; null: where the source is live
     realtime: bool | None = None

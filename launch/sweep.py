@@ -13,10 +13,12 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.types import ValueType
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from launch.checks import check
 from launch.compose import compose, parse
+from launch.output import make_folder, new_folder
 from launch.refusal import GraphError
 
 SUBMITIT = "hydra_plugins.hydra_submitit_launcher"
@@ -63,6 +65,40 @@ def check_jobs(overrides: Sequence[str], conf: Path) -> None:
             check(compose(words, conf))
         except GraphError as error:
             raise GraphError(f"job {number} of the sweep: {error}") from error
+
+
+def named_folder(overrides: Sequence[str]) -> Path | None:
+    """What `output=` names, in which each job of a sweep has a numbered folder; None where it names nothing.
+
+    Raises GraphError where it is no name of one folder.
+    """
+    given = [override for override in map(parse, overrides) if override.key_or_group == "output"]
+    if not given:
+        return None
+    override, text = given[-1], str(given[-1].input_line)
+    if override.is_sweep_override():
+        raise GraphError(f"{text}: the jobs of a sweep are numbered folders in one output; give one name")
+    value = override.value()
+    if isinstance(value, int | float):  # as of a run, a folder may have such a name
+        value = text.partition("=")[2]
+    if not isinstance(value, str | None):
+        raise GraphError(f"{text}: must be the name of a folder; write output=./NAME")
+    try:
+        name = OmegaConf.create({"output": value}).output
+    except OmegaConfBaseException as error:
+        said = str(error).splitlines()[0]
+        raise GraphError(f"{text}: a sweep's output takes no value of another key: {said}") from error
+    return Path(name).expanduser().absolute() if name else None
+
+
+def made_folder(named: Path | None) -> Path:
+    """The folder of a sweep's jobs, now there: the one that is named, or else one that no other sweep has.
+
+    Raises GraphError where there can be none.
+    """
+    folder = named or new_folder(Path(f"runs/{time.strftime('%Y-%m-%d_%H-%M-%S')}-sweep").absolute())
+    make_folder(folder)
+    return folder
 
 
 def swept() -> list[Path]:

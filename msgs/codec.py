@@ -11,7 +11,7 @@ import math
 import struct
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from typing import Any, NamedTuple
 
@@ -90,34 +90,18 @@ def encode(
     of its type.
     """
     name = type(message).__name__
-    specs = _SPECS.get(name)
-    if specs is None or msgs.TYPES[name] is not type(message):
-        raise CodecError(f"{type(message).__qualname__} is no message; the types are {', '.join(_SPECS)}")
     scalars: dict[str, Any] = {}
     arrays: dict[str, list[Any]] = {}
     values: list[tuple[np.ndarray, int]] = []  # with their offsets
-    sizes: dict[str, int] = {}
     end = 0  # of the array section
-    for field, spec in specs.items():
-        value = getattr(message, field)
-        where = f"{name}.{field}"
-        if not isinstance(spec, ArraySpec):
-            value = _checked_scalar(value, spec, where)
-            if field not in _DEFAULTS[name] or value != _DEFAULTS[name][field]:
-                scalars[field] = value
-        elif value is None and spec.optional:
-            if field not in _DEFAULTS[name]:  # programs from before the field was there read the message, too
-                scalars[field] = None
-        else:
-            if not isinstance(value, np.ndarray):
-                raise CodecError(f"{where} is a {type(value).__name__}, not an array")
-            if value.dtype != spec.dtype:
-                raise CodecError(f"{where} must be {spec.name}, not {value.dtype}")
-            _check_shape(spec, value.shape, sizes, where)
+    for field, value in _checked_fields(message):
+        if isinstance(value, np.ndarray):
             offset = _aligned(end)
             end = offset + value.nbytes
-            arrays[field] = [spec.name, value.shape, offset]
+            arrays[field] = [value.dtype.name, value.shape, offset]
             values.append((value, offset))
+        elif field not in _DEFAULTS[name] or value != _DEFAULTS[name][field]:
+            scalars[field] = value  # a default is left out: programs from before the field was there read the rest
     content: dict[str, Any] = {"sequence": sequence, "scalars": scalars, "arrays": arrays}
     if before:
         content[_ORDER_KEY] = dict(before)
@@ -147,6 +131,12 @@ def encode(
         end = start + value.nbytes
         buffer[start:end].view(value.dtype).reshape(value.shape)[...] = value
     return frame
+
+
+def check(message: msgs.Message) -> None:
+    """Raises CodecError where a field differs from its annotation, as `encode` does, and copies nothing."""
+    for _ in _checked_fields(message):
+        pass
 
 
 def decode(frame: Any, *, expect: tuple[type, ...] | None = None) -> Decoded:
@@ -205,6 +195,26 @@ def max_message_bytes(message_type: type) -> int:
 def array_specs(message_type: type) -> dict[str, FieldSpec]:
     """Field name -> what the annotation asks for."""
     return dict(_SPECS[message_type.__name__])
+
+
+def _checked_fields(message: msgs.Message) -> Iterator[tuple[str, Any]]:
+    """Its fields by name: arrays as they are, numbers and texts as Python's own."""
+    name = type(message).__name__
+    specs = _SPECS.get(name)
+    if specs is None or msgs.TYPES[name] is not type(message):
+        raise CodecError(f"{type(message).__qualname__} is no message; the types are {', '.join(_SPECS)}")
+    sizes: dict[str, int] = {}
+    for field, spec in specs.items():
+        value, where = getattr(message, field), f"{name}.{field}"
+        if not isinstance(spec, ArraySpec):
+            value = _checked_scalar(value, spec, where)
+        elif value is not None or not spec.optional:
+            if not isinstance(value, np.ndarray):
+                raise CodecError(f"{where} is a {type(value).__name__}, not an array")
+            if value.dtype != spec.dtype:
+                raise CodecError(f"{where} must be {spec.name}, not {value.dtype}")
+            _check_shape(spec, value.shape, sizes, where)
+        yield field, value
 
 
 def _aligned(offset: int) -> int:

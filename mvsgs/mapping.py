@@ -93,8 +93,9 @@ class Mapping:
     Threads: all methods may be called from any thread; each call waits for the one before. Several of these objects
     share nothing and may work at the same time.
 
-    Failing: what is refused of a frame raises TypeError or ValueError and changes nothing. An exception of another kind
-    ends the stream: the map so far can be rendered and saved, `add` and `finish` raise RuntimeError.
+    Failing: what is refused of a frame raises TypeError or ValueError and changes nothing. An exception out of the
+    nodes' work, or Ctrl-C in its midst, ends the stream: the map so far can be rendered and saved, `add` and `finish`
+    raise RuntimeError.
     """
 
     def __init__(
@@ -244,8 +245,9 @@ class Mapping:
         and what `Mapping.load` goes on with and `mvsgs info` shows (not where poses were given).
 
         images: each keyframe's image, too; `warnings` says how many could not be. An earlier save there is replaced.
-        Raises OSError; ValueError for the output of a run and for a folder where files of others would be replaced,
-        RuntimeError where there is no map yet, or nothing new since it was loaded.
+        Raises OSError; ValueError for the output of a run, for a folder where files of others would be replaced, and
+        for the root of the file system and the home folder themselves; RuntimeError where there is no map yet, or
+        nothing new since it was loaded.
         """
         with self._lock:
             self._check_map()

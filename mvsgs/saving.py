@@ -18,6 +18,7 @@ from mvsgs_core.mapping.checkpoints.results import cameras_of, write_results
 from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.resting_images import on_disk
+from mvsgs_core.shared_folder import refusal, shared
 from mvsgs_core.trajectory import Trajectory
 from mvsgs_core.trajectory_file import write_trajectory
 
@@ -36,8 +37,11 @@ def save_map(
     part of the stream are written; None: that of the keyframes is. images: the keyframes', too. came: of keyframes that
     are trained on another image than the one that came, the latter (H, W, 3) uint8, by index.
     Returns how many keyframes have no image that could be written. Raises OSError; ValueError for a folder with the
-    report of a run, which would be another map's then, or with files of others that would be replaced.
+    report of a run, which would be another map's then, or with files of others that would be replaced, and for the
+    root of the file system and the home folder.
     """
+    if what := shared(folder):
+        raise ValueError(f"{folder}: {refusal(folder, what, 'a map')}")
     if (folder / "report.json").exists():
         raise ValueError(f"{folder}: is the output of a run, with its report; save to another folder")
     earlier = _saved_keyframes(folder)

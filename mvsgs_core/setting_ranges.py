@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 SEEDS = (0, 2**32 - 1)  # what NumPy takes
+LARGEST = SEEDS[1]  # of an integer: more is no number of anything that is counted here
+# beside a type, as in Annotated[float, UNBOUNDED]: a setting may be infinite, or an integer beyond LARGEST, as far as
+# its own range goes; where a default is so large, it need not be said
+UNBOUNDED = "unbounded"
 
 
 def at_least(config: object, **least: float) -> None:
@@ -29,4 +33,4 @@ def within(config: object, **ranges: tuple[float, float]) -> None:
             raise ValueError(f"{name}={value}: must be from {low} to {high}")
 
 
-__all__ = ["SEEDS", "above", "at_least", "within"]
+__all__ = ["LARGEST", "SEEDS", "UNBOUNDED", "above", "at_least", "within"]

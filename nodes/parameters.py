@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import sys
 import types
 import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -16,7 +17,10 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+from mvsgs_core.setting_ranges import LARGEST, UNBOUNDED
+
 T = TypeVar("T")
+MOST: dict[type, float] = {int: LARGEST, float: sys.float_info.max}  # of a number that is not UNBOUNDED
 
 
 class ParameterError(ValueError):
@@ -39,7 +43,7 @@ def build(config: type[T], given: Mapping[str, Any], where: str = "", base: T | 
 
     `where`: the path of these parameters, as a user writes it (`mapper.insertion`). Raises ParameterError.
     """
-    hints = typing.get_type_hints(config)
+    hints = typing.get_type_hints(config, include_extras=True)
     declared = {field.name: field for field in fields(config) if field.init}  # type: ignore[arg-type]
     for name in given:
         if name not in declared:
@@ -58,7 +62,7 @@ def build(config: type[T], given: Mapping[str, Any], where: str = "", base: T | 
         elif (nested := nested_in(hints[name])) and isinstance(default, nested) and isinstance(given[name], Mapping):
             values[name] = build(nested, given[name], path, default)  # the rest as it is here, not as in general
         else:
-            values[name] = convert(given[name], hints[name], path)
+            values[name] = convert(given[name], hints[name], path, bounded=not _is_beyond(default))
     try:
         return config(**values)
     except ValueError as error:
@@ -131,21 +135,25 @@ def did_you_mean(word: str, valid: Iterable[str]) -> str:
     return f" (did you mean {close[0]}?)" if close else ""
 
 
-def convert(value: Any, annotation: Any, where: str) -> Any:
-    """`value` as an instance of the annotated type. Raises ParameterError, naming `where`, where it is none."""
+def convert(value: Any, annotation: Any, where: str, *, bounded: bool = True) -> Any:
+    """`value` as an instance of the annotated type. Raises ParameterError, naming `where`, where it is none.
+
+    bounded: numbers are finite, and integers at most LARGEST, unless the annotation says UNBOUNDED.
+    """
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     kind = origin or annotation
     if origin is typing.Annotated:
-        return convert(value, arguments[0], where)
+        return convert(value, arguments[0], where, bounded=bounded and UNBOUNDED not in arguments[1:])
     if annotation is Any or annotation is object or (annotation is type(None) and value is None):
         return value
     if origin in (typing.Union, types.UnionType):
         # the member that the value already is comes first, so that int | str keeps 3 a number
         for member in sorted(arguments, key=lambda member: type(value) is not member):
             try:
-                return convert(value, member, where)
+                return convert(value, member, where, bounded=bounded)
             except ParameterError:
-                continue
+                if type(value) is member:  # and beyond its bounds: no text either
+                    break
     elif origin is Literal:
         if any(value == argument and type(value) is type(argument) for argument in arguments):
             return value
@@ -154,19 +162,19 @@ def convert(value: Any, annotation: Any, where: str) -> Any:
             return build(kind, value, where)
     elif kind in (tuple, list, Sequence):
         if isinstance(value, Sequence) and not isinstance(value, str):
-            return _sequence(value, annotation, where)
+            return _sequence(value, annotation, where, bounded)
     elif kind in (dict, Mapping):
         if isinstance(value, Mapping):
             of = arguments[1] if arguments else Any
-            return {str(key): convert(item, of, f"{where}.{key}") for key, item in value.items()}
+            return {str(key): convert(item, of, f"{where}.{key}", bounded=bounded) for key, item in value.items()}
     elif isinstance(kind, type):
-        scalar = _scalar(value, kind)
+        scalar = _scalar(value, kind, bounded)
         if scalar is not None:
             return scalar
     raise _wrong_type(value, annotation, where)
 
 
-def _sequence(value: Sequence[Any], annotation: Any, where: str) -> Any:
+def _sequence(value: Sequence[Any], annotation: Any, where: str, bounded: bool) -> Any:
     kind, arguments = typing.get_origin(annotation) or annotation, typing.get_args(annotation)
     if kind is tuple and arguments and arguments[-1] is not Ellipsis:
         if len(value) != len(arguments):
@@ -174,20 +182,29 @@ def _sequence(value: Sequence[Any], annotation: Any, where: str) -> Any:
         types_of = arguments
     else:
         types_of = (arguments[0] if arguments else Any,) * len(value)
-    items = [convert(item, of, f"{where}[{i}]") for i, (item, of) in enumerate(zip(value, types_of, strict=True))]
+    pairs = enumerate(zip(value, types_of, strict=True))
+    items = [convert(item, of, f"{where}[{i}]", bounded=bounded) for i, (item, of) in pairs]
     return tuple(items) if kind is tuple else items
 
 
-def _scalar(value: Any, kind: type) -> Any:
+def _scalar(value: Any, kind: type, bounded: bool = True) -> Any:
     """A bool, int, float, str, path or member of an enumeration; None where `value` is no such thing."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if issubclass(kind, Enum):
         return kind[value] if isinstance(value, str) and value in kind.__members__ else None
-    if kind is float:  # NaN is below, above and equal to nothing: no check would find it
-        return float(value) if is_number and not math.isnan(value) else None
+    if kind in MOST:  # NaN is below, above and equal to nothing: no other check would find it
+        most = MOST[kind] if bounded else math.inf
+        fits = is_number and (kind is float or isinstance(value, int)) and abs(value) <= most
+        return (float(value) if kind is float else value) if fits else None
     if kind in (str, Path):
         return kind(str(value)) if is_number or isinstance(value, str | Path) else None
     return value if isinstance(value, kind) and (kind is bool or not isinstance(value, bool)) else None
+
+
+def _is_beyond(default: Any) -> bool:
+    """Whether a default is no bounded number, or has one among several."""
+    items = default if isinstance(default, list | tuple) else [default]
+    return any(isinstance(item, int | float) and _scalar(item, type(item)) is None for item in items)
 
 
 def type_name(annotation: Any) -> str:
@@ -211,8 +228,12 @@ def type_name(annotation: Any) -> str:
 
 
 def _wrong_type(value: Any, annotation: Any, where: str) -> ParameterError:
-    nan = "not a number, " if isinstance(value, float) and math.isnan(value) else ""
-    return ParameterError(f"{where}={value}: {nan}must be {type_name(annotation)}")
+    why = ""
+    if isinstance(value, float) and not math.isfinite(value):
+        why = "not a number, " if math.isnan(value) else "not finite, "
+    elif isinstance(value, int) and abs(value) > LARGEST:
+        why = f"beyond {LARGEST}, "
+    return ParameterError(f"{where}={value}: {why}must be {type_name(annotation)}")
 
 
 def _meant(config: type, where: str, name: str, given: Mapping[str, Any]) -> str:

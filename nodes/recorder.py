@@ -7,6 +7,8 @@ schema lists the fields with their dtypes and shapes. Beside them are channels t
 
 from __future__ import annotations
 
+import os
+import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -40,8 +42,12 @@ class Recorder(Node):
 
     @classmethod
     def check(cls, config: Config) -> None:
-        if Path(config.path).exists():
-            raise FileExistsError(f"path={config.path}: that recording exists already; give another file")
+        try:
+            problem = _problem(config.path)
+        except OSError as error:
+            problem = f"{error.strerror or error}; give a file that can be written"
+        if problem:
+            raise OSError(f"path={config.path}: {problem}")
         shown = {t.__name__ for t in READ}
         if unknown := sorted(set(config.only_shown) - shown):
             raise ValueError(f"only_shown={unknown}: Foxglove's channels show {', '.join(sorted(shown))}")
@@ -121,6 +127,22 @@ class Recorder(Node):
             self._writer.finish()
             self._file.close()
             self._file = None
+
+
+def _problem(path: str) -> str | None:
+    """Why there can be no new recording of that name. Raises OSError where nothing can be written there."""
+    if not path:
+        return "is empty; give a file, such as recording.mcap"
+    file = Path(path).absolute()
+    if file.is_dir():
+        return f"is a folder; give a file, such as {file / 'recording.mcap'}"
+    if os.path.lexists(file):
+        return "that recording exists already; give another file"
+    place = next(folder for folder in file.parents if folder.exists())
+    if not place.is_dir():
+        return f"{place} is a file; give another file"
+    tempfile.TemporaryFile(dir=place).close()  # leaves nothing
+    return None
 
 
 def _describe(message_type: type) -> bytes:

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import json
 import re
+import signal
 import sys
+import threading
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
 
 from examples import camera_loop, my_loss
+from msgs import Frame
 from mvsgs import GaussianMap, Mapping
 from mvsgs_core.image_metrics import psnr
+from nodes import Node
 from tests.support.sequences import synthetic
 from tests.support.shared_data import ROOT
 
@@ -49,13 +54,18 @@ def test_no_output_is_kept_in_the_notebook() -> None:
     assert all(not cell["outputs"] and cell["execution_count"] is None for cell in found if "outputs" in cell)
 
 
-def test_the_loop_over_a_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    items, video = synthetic(frames=FRAMES, size=SIZE), tmp_path / "walk.avi"
+def filmed(folder: Path) -> tuple[Path, list[str]]:
+    """A video of the room, and its camera as words of the command line."""
+    items, video = synthetic(frames=FRAMES, size=SIZE), folder / "walk.avi"
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"MJPG"), 20.0, SIZE[::-1])
     for item in items:
         writer.write(cv2.cvtColor(item.image, cv2.COLOR_RGB2BGR))
     writer.release()
-    camera = ["--intrinsics", *map(str, items[0].intrinsics.tolist())]
+    return video, ["--intrinsics", *map(str, items[0].intrinsics.tolist())]
+
+
+def test_the_loop_over_a_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    video, camera = filmed(tmp_path)
     words = ["--video", str(video), *camera, "--save", str(tmp_path / "map"), *SMALL]
     camera_loop.main(["--every-frame", *words])
     said = capsys.readouterr().out
@@ -66,6 +76,47 @@ def test_the_loop_over_a_camera(tmp_path: Path, capsys: pytest.CaptureFixture[st
     taken = [seconds for _, seconds in newest]
     assert taken == sorted(taken)
     assert len(taken) + newest.left_out == FRAMES
+
+
+def test_ctrl_c_in_the_midst_of_a_frame_leaves_the_camera_and_keeps_the_map(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen, before = [], signal.getsignal(signal.SIGINT)
+
+    def observe(self: Mapping, slot: str, node: Node, message: Any) -> None:
+        watched(self, slot, node, message)
+        if isinstance(message, Frame):
+            seen.append(message.index)
+            if message.index == 15:
+                signal.raise_signal(signal.SIGINT)
+
+    watched = Mapping._observe
+    monkeypatch.setattr(Mapping, "_observe", observe)
+    video, camera = filmed(tmp_path)
+    camera_loop.main(["--every-frame", "--video", str(video), *camera, "--save", str(tmp_path / "map"), *SMALL])
+    assert seen == list(range(16))
+    said = capsys.readouterr().out
+    assert "the camera is left; the map is finished" in said
+    assert f"saved in {tmp_path / 'map'}" in said
+    assert len(GaussianMap.load(tmp_path / "map")) > 500
+    assert signal.getsignal(signal.SIGINT) == before
+
+
+def test_a_second_ctrl_c_ends_the_loop_at_once_and_a_camera_that_hangs_holds_up_none() -> None:
+    class Hanging:
+        def read(self) -> tuple[bool, None]:
+            over.wait()
+            return False, None
+
+    over = threading.Event()
+    try:
+        with camera_loop.ctrl_c() as left:
+            threading.Timer(0.1, signal.raise_signal, [signal.SIGINT]).start()
+            assert list(camera_loop.NewestFrame(Hanging(), None, left)) == []  # type: ignore[arg-type]
+            assert left.is_set()
+            assert signal.getsignal(signal.SIGINT) == signal.SIG_DFL
+    finally:
+        over.set()
 
 
 def test_the_loss_in_a_program_and_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import defaultdict
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from launch.placement import niceness, own_threads, thread_plan
 from launch.refusal import GraphError
 from launch.specs import addresses, spec
 from msgs import Frame, GroundTruth, Keyframe, Poses
+from mvsgs_core.setting_ranges import LARGEST
 from nodes.parameters import ParameterError, convert
 from tests.support.fake_graph.stages import Relay, Sink
 
@@ -162,6 +164,12 @@ def test_observers_are_those_declared_and_readers_of_best_effort_edges_only() ->
         fake("relay.observer=true")
 
 
+def test_what_an_observer_lacks_it_can_be_left_out_for() -> None:
+    with pytest.raises(GraphError, match=r"a GroundTruth: .* \(no slot does; evaluator=off runs without it\)"):
+        compose([f"dataset._target_={STAGES}.Sighted"])
+    assert compose([f"dataset._target_={STAGES}.Sighted", "evaluator=off"]).sources == ["dataset"]
+
+
 def test_a_cycle_is_refused_with_its_path() -> None:
     with pytest.raises(GraphError, match=r"a cycle: (relay -> sink -> relay|sink -> relay -> sink)"):
         fake(f"sink._target_={STAGES}.Loop", "relay.reads.Frame=sink")
@@ -270,6 +278,8 @@ def test_a_stage_on_a_gpu_leaves_the_cores_to_the_others() -> None:
 def test_a_value_is_converted_to_its_type_or_refused(value: object) -> None:
     for annotation in (int, float, bool, int | None, float | str):
         fits = isinstance(value, annotation) and (annotation is bool or not isinstance(value, bool))
+        if isinstance(value, int | float):
+            fits &= abs(value) <= (LARGEST if isinstance(value, int) else sys.float_info.max)
         try:
             converted = convert(value, annotation, "x")
         except ParameterError:

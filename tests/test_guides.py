@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 import mvsgs_core.datasets as datasets
+from launch.compose import compose
+from launch.inline import run_inline
 from launch.named_input import with_named_input
 from mvsgs import GaussianMap, Mapping
 from mvsgs_core.bad_file import BadFileError
@@ -20,7 +24,7 @@ pytestmark = pytest.mark.slow
 
 GUIDES = ROOT / "docs" / "guides"
 SMALL = ("mapper.iterations=3", "mapper.refinement=3", "device=cpu", "mapper.threads=1", "tracker.threads=1")
-ROOM = {"frames": 26, "size": (96, 128)}
+ROOM: dict[str, Any] = {"frames": 26, "size": (96, 128)}
 
 
 def code(document: Path) -> str:
@@ -51,6 +55,27 @@ def test_the_node_of_the_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
             mapping.add(item.image, item.timestamp, pose=item.world_from_cam)
     assert mapping.statistics["depth_fusion"]["counts"]["pixels left out"] > 0
     assert len(mapping.map) > 100
+
+
+@pytest.mark.parametrize("blind", [False, True])
+def test_the_source_of_the_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, blind: bool) -> None:
+    program = re.findall(r"^```python\n(.*?)^```", (GUIDES / "data_set.md").read_text(), re.DOTALL | re.MULTILINE)[-1]
+    if blind:  # the other way that the guide tells of
+        lines = [line for line in program.splitlines() if "yield GroundTruth" not in line]
+        program = "\n".join(lines).replace("Iterator[Frame | GroundTruth]", "Iterator[Frame]")
+    name = f"camera_of_the_guide_{blind}"
+    (tmp_path / f"{name}.py").write_text(program)
+    monkeypatch.chdir(tmp_path)
+    items = synthetic(**ROOM)
+    writer = cv2.VideoWriter("walk.avi", cv2.VideoWriter_fourcc(*"MJPG"), 30.0, ROOM["size"][::-1])
+    for item in items:
+        writer.write(cv2.cvtColor(item.image, cv2.COLOR_RGB2BGR))
+    writer.release()
+    words = [f"dataset._target_={name}.Camera", "dataset.video=walk.avi", f"dataset.focal={items[0].intrinsics[0]}"]
+    found = run_inline(compose([*SMALL, *words, "output=out", *(["evaluator=off"] if blind else [])]))
+    assert found["dataset"].stats.warnings == []
+    assert len(GaussianMap.load("out")) > 100
+    assert Path("out/report.json").exists() != blind
 
 
 def test_the_reader_of_the_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -169,8 +169,9 @@ def test_any_name_of_a_folder_is_taken_as_it_is_or_it_is_said_how_to_write_it(na
         assert Path(str(found)).name == name
 
 
-def test_the_folder_of_a_sweep_may_have_any_name() -> None:
-    assert "hydra.sweep.dir='./Küche (1)'" in hydra_arguments(["-m", "output=./Küche (1)", "seed=1,2"])
+def test_the_folder_of_a_sweep_may_have_any_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert f"hydra.sweep.dir='{tmp_path}/Küche (1)'" in hydra_arguments(["-m", "output=./Küche (1)", "seed=1,2"])
 
 
 HIDDEN = ("gopro/._GX010001.MP4", "gopro/GL010001.LRV", "gopro/GX010001.MP4", "hidden/.DS_Store")

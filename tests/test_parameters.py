@@ -5,16 +5,17 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pytest
 
 from msgs import End, Frame, Keyframe
 from msgs.codec import decode, encode
+from mvsgs_core.setting_ranges import LARGEST, UNBOUNDED
 from nodes import Node
 from nodes.parameters import ParameterError, build, parameters, plain_values
 from nodes.runtime.plain import plain
@@ -51,6 +52,10 @@ class Sample(Node):
         limits: dict[str, float] = field(default_factory=dict)
         number: int | float = 0
         flag: bool = False
+        reach: float = math.inf
+        span: tuple[float, float] = (0.0, math.inf)
+        total: int = 2**40
+        far: Annotated[float, UNBOUNDED] = 1.0
 
 
 def test_plain_values_become_what_the_annotations_say() -> None:
@@ -78,7 +83,6 @@ def test_plain_values_become_what_the_annotations_say() -> None:
         3, 2.0, None, Path("a/b"), (4, 5), ["u"], (1.0, 2.5), "slow", Color.BLUE, Inner(1.0), (Inner(2.0), Inner()),
         {"any": [1, None]}, {"a": 1.0}, 3, True,
     )  # fmt: skip
-    assert build(Sample.Config, {"required": 1, "ratio": math.inf}).ratio == math.inf
     assert build(Sample.Config, json.loads(json.dumps(plain_values(config)))) == config  # and back
     assert isinstance(config.number, int)
     assert isinstance(config.limits["a"], float)
@@ -107,12 +111,24 @@ def test_plain_values_become_what_the_annotations_say() -> None:
         ({"required": 1, "limits": {"a": "b"}}, "sample.limits.a=b: must be float"),
         ({"required": 1, "ratio": float("nan")}, "sample.ratio=nan: not a number, must be float"),
         ({"required": 1, "many": [1.0, float("nan")]}, "sample.many[1]=nan: not a number, must be float"),
+        ({"required": 1, "ratio": math.inf}, "sample.ratio=inf: not finite, must be float"),
+        ({"required": 1, "ratio": 10**400}, ": beyond 4294967295, must be float"),
+        ({"required": 1, "limits": {"a": -math.inf}}, "sample.limits.a=-inf: not finite, must be float"),
+        ({"required": LARGEST + 1}, "sample.required=4294967296: beyond 4294967295, must be int"),
+        ({"required": 1, "far": math.nan}, "sample.far=nan: not a number, must be float"),
     ],
 )
 def test_what_does_not_fit_is_named(given: dict[str, Any], error: str) -> None:
     with pytest.raises(ParameterError) as caught:
         build(Sample.Config, given, "sample")
     assert error in str(caught.value)
+
+
+def test_what_is_as_large_by_default_or_says_so_may_be() -> None:
+    config = build(Sample.Config, {"required": 1, "reach": math.inf, "span": [0, math.inf], "far": -math.inf})
+    assert (config.reach, config.span, config.far) == (math.inf, (0.0, math.inf), -math.inf)
+    assert build(Sample.Config, {"required": LARGEST, "total": 2**41}).total == 2**41
+    assert build(Sample.Config, {"required": 1, "ratio": 1e300}).ratio == 1e300
 
 
 @dataclass(frozen=True)
@@ -162,6 +178,23 @@ def test_a_runner_gives_what_the_hook_yields_and_counts_it() -> None:
 def test_a_runner_refuses_what_a_node_did_not_declare() -> None:
     with pytest.raises(TypeError, match="Wrong yields a Frame, but its annotations say Keyframe"):
         list(Runner("wrong", Wrong()).handle(frame()))
+
+
+def test_a_runner_refuses_frames_that_are_not_numbered_upward() -> None:
+    class Numbered(Node):
+        indices = (0, 3)
+
+        def run(self) -> Iterator[Frame]:
+            for index in self.indices:
+                yield replace(frame(), index=index)
+
+    node = Numbered()
+    runner = Runner("camera", node)
+    assert len(list(runner.source())) == 2
+    for wrong in (3, 1):
+        node.indices = (wrong, 4)  # begun again, as a program's source is
+        with pytest.raises(ValueError, match=f"Numbered yields Frame {wrong} after Frame 3: a source's frames are"):
+            list(runner.source())
 
 
 def test_a_runner_refuses_a_node_that_was_not_made_as_one() -> None:

@@ -278,6 +278,31 @@ def test_a_recording_without_anything_to_play_is_refused_before_the_run(tmp_path
         compose_and_check(["dataset=player", f"dataset.path={path}"])
 
 
+def test_a_recording_that_cannot_be_made_is_refused_before_the_run(tmp_path: Path) -> None:
+    def refusal(path: object) -> str:
+        with pytest.raises(OSError, match=r"^path=") as refused:
+            Recorder.check(Recorder.Config(str(path)))
+        return str(refused.value)
+
+    file = tmp_path / "file.mcap"
+    file.touch()
+    (tmp_path / "link.mcap").symlink_to(tmp_path / "nowhere")
+    assert refusal("") == "path=: is empty; give a file, such as recording.mcap"
+    assert f"is a folder; give a file, such as {tmp_path}/recording.mcap" in refusal(tmp_path)
+    assert f"{file} is a file; give another file" in refusal(file / "new" / "a.mcap")
+    assert "exists already" in refusal(file)
+    assert "exists already" in refusal(tmp_path / "link.mcap")
+    assert "File name too long; give a file that can be written" in refusal(tmp_path / ("a" * 300))
+    Recorder.check(Recorder.Config(str(tmp_path / "new" / "folder" / "a.mcap")))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file.mcap", "link.mcap"], "nothing is made"
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="there is no /proc, in which nobody can make a file")
+def test_a_recording_where_nothing_can_be_written_is_refused_before_the_run() -> None:
+    with pytest.raises(OSError, match=r"^path=/proc/a\.mcap: .*; give a file that can be written$"):
+        Recorder.check(Recorder.Config("/proc/a.mcap"))
+
+
 def compose_and_check(overrides: list[str]) -> None:
     graph = compose([*overrides, "output=/tmp/x"])
     slot = graph.slots["dataset"]

@@ -94,6 +94,7 @@ def fill(folder: Path) -> None:
             "best_effort=Frames: no such message (did you mean Frame?)",
         ),
         (["photos", "transport=tcp", "port=65534"], "ports from there on, of 1 to 65535"),
+        (["photos", f"output={'a' * 300}"], f"/{'a' * 300}: File name too long"),
         (["photos", "output=[2024]"], "output=[2024]: must be the name of a folder; write output=./NAME"),
         (["photos", "viewer"], "a parameter is written slot.parameter=value"),
     ],

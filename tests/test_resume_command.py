@@ -67,6 +67,57 @@ def test_a_stream_that_is_gone_leaves_the_checkpoint_to_be_refined(tmp_path: Pat
     }
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("dataset.stride=3", "dataset.stride=3 (was 1)"),
+        ("dataset.start=2 dataset.hide_fixed=false", "dataset.start=2 (was 0), dataset.hide_fixed=False (was True)"),
+        ("dataset.size=[48,64]", "dataset.size=[48, 64] (was [240, 320])"),
+        ("dataset.options.scene=town", "dataset.options.scene=town (was room)"),
+        ("dataset.stop=50", "dataset.stop=50 (was 80)"),
+        ("dataset.path=elsewhere", "dataset.path=elsewhere (was null)"),
+        ("dataset=tum", "dataset.name=tum (was synthetic)"),
+        ("dataset=camera", "dataset=nodes.camera.Camera (was nodes.reader.Reader)"),
+    ],
+)
+def test_other_frames_than_the_map_s_are_refused(words: str, said: str, tmp_path: Path) -> None:
+    with pytest.raises(GraphError) as refused:
+        resumed_config(interrupted(tmp_path, "dataset.stop=80"), words.split())
+    assert said in str(refused.value)
+    assert "leave that out, or begin another run with output=DIR" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["dataset.stop=null", "dataset.stop=90", "dataset.realtime=true", "dataset.options.threads=1", "dataset.stride=1"],
+)
+def test_the_same_frames_and_later_ones_are_taken(words: str, tmp_path: Path) -> None:
+    assert "dataset" in resumed(interrupted(tmp_path, "dataset.stop=80"), *words.split()).slots
+
+
+def test_a_file_that_has_moved_is_found_where_it_is_now(tmp_path: Path) -> None:
+    for name in ("a.mcap", "b.mcap"):
+        (tmp_path / name).touch()
+    folder = interrupted(tmp_path / "run", "dataset=player", f"dataset.path={tmp_path / 'a.mcap'}")
+    (tmp_path / "link.mcap").symlink_to("a.mcap")
+    assert resumed(folder, f"dataset.path={tmp_path / 'link.mcap'}").slots
+    with pytest.raises(GraphError, match="leave that out"):
+        resumed(folder, f"dataset.path={tmp_path / 'b.mcap'}")
+    (tmp_path / "a.mcap").unlink()
+    assert resumed(folder, f"dataset.path={tmp_path / 'b.mcap'}").slots
+
+
+def test_the_map_is_refined_alone_where_that_is_asked_for(tmp_path: Path) -> None:
+    after = resumed(interrupted(tmp_path), "dataset=resumed")
+    assert list(after.slots) == ["dataset", "mapper", "evaluator"]
+    assert after.slots["dataset"].config == {"path": str(tmp_path)}
+
+
+def test_a_name_that_is_too_long_for_a_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(GraphError, match=r"^resume=.*: File name too long$"):
+        resumed_config(tmp_path / ("a" * 300), ())
+
+
 def test_a_recording_that_is_there_is_not_written_again(tmp_path: Path) -> None:
     (interrupted(tmp_path, "recorder=mcap") / "recording.mcap").touch()
     config = resumed_config(tmp_path, ())

@@ -15,6 +15,7 @@ from mvsgs_core.kept_map import check_kept_map, tracker_file
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.begun import begin_on
 from mvsgs_core.mapping.checkpoints.results import cameras_of
+from mvsgs_core.shared_folder import ROOT, shared
 from mvsgs_core.stats import Stats
 from mvsgs_core.trajectory import Trajectory
 from tests.support.small_atlas import PLAIN, SIZE, begun, written
@@ -39,6 +40,22 @@ def test_files_that_no_save_has_left_are_not_replaced(atlas: Atlas, tmp_path: Pa
     with pytest.raises(ValueError, match=rf"{name.partition('/')[0]} is there and was left by no save of a map"):
         save_map(tmp_path, atlas, None, None, images)
     assert files(tmp_path) == before
+
+
+def test_neither_the_root_nor_the_home_folder_itself_takes_a_map(
+    atlas: Atlas, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "link").symlink_to(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for folder in (tmp_path, tmp_path / "link"):
+        with pytest.raises(ValueError, match=f"^{folder}: is your home folder; a map .* such as {folder}/runs/first"):
+            save_map(folder, atlas, None, None, images=False)
+    monkeypatch.setattr("mvsgs.saving.shared", lambda folder: ROOT)  # instead of the one that there is
+    with pytest.raises(ValueError, match="is the root of the file system; a map needs a folder of its own"):
+        save_map(tmp_path / "root", atlas, None, None, images=False)
+    assert files(tmp_path) == {}
+    assert shared(Path("/")) == shared(Path("//")) == ROOT
+    assert shared(tmp_path / "runs") is None
 
 
 def test_an_earlier_save_is_replaced_and_what_others_left_beside_it_stays(atlas: Atlas, tmp_path: Path) -> None:

@@ -81,6 +81,29 @@ def refusal(*words: str) -> str:
         ("tracker.flow=json:Flow", "or module:Class; there is no 'Flow' in json"),
         ("tracker.device=gpu", "must be auto, cpu, cuda or cuda:<number>"),
         ("tracker.min_texture=nan", "not a number, must be float"),
+        ("tracker.min_texture=2.0", "must be from 0 to 1"),
+        ("tracker.tolerance=-1.0", "must be 0 or more"),
+        ("tracker.local_map.recent=0", "must be 1 or more"),
+        ("tracker.local_map.window=-1", "must be 2 or more"),
+        ("tracker.local_map.steps=-1", "must be 0 or more"),
+        ("tracker.local_map.robust_scale=0.0", "must be above 0"),
+        ("tracker.local_map.window=1 tracker=ground_truth", "must be 2 or more"),
+        ("tracker.initialization.patience=0", "must be 1 or more"),
+        ("tracker.initialization.forced.min_parallax=-1.0", "must be 0 or more"),
+        ("tracker.keyframe_choice.max_flow=-1.0", "must be 0 or more"),
+        ("tracker.front_end.lost_inliers=1.5", "must be from 0 to 1"),
+        ("tracker.covisibility.max_candidates=-1", "must be 0 or more"),
+        ("tracker.loop.min_gap=-1", "must be 0 or more"),
+        ("tracker.loop.criteria.min_inliers=0.0", "must be above 0"),
+        ("tracker.relocalization.patience=0", "must be 1 or more"),
+        ("tracker.recovery.max_images=-1", "must be 0 or more"),
+        ("tracker.back_end.max_keyframes=1", "must be 2 or more"),
+        ("tracker.focal.probe=1.0", "must be above 0 and below 1"),
+        ("mapper.optimizer.means=inf", "not finite, must be float"),
+        ("mapper.iterations=100000000000", "beyond 4294967295, must be int or null"),
+        ("mvs.threads=2000", "must be 1 or more, at most 1024, or null"),
+        ("depth_fusion.confidence=inf", "not finite, must be float"),
+        ("depth_fusion.confidence=1.5", "must be from 0 to 1"),
     ],
 )
 def test_a_setting_out_of_its_range_is_named(words: str, wanted: str) -> None:
@@ -98,10 +121,27 @@ def test_a_setting_out_of_its_range_is_named(words: str, wanted: str) -> None:
         "mvs.lag=0 mvs.window=0 mvs.area=1 mvs.efforts=[3] mvs.device=torch",
         "depth_fusion.lag=0 depth_fusion.window=0 depth_fusion.neighbors=0 depth_fusion.efforts=[0,2]",
         "tracker.area=1024 tracker.flow=dis tracker.front_end.still_flow=inf",
+        "tracker.covisibility.max_flow=0 tracker.recovery.max_images=0 tracker.loop.max_candidates=0 mvs.threads=1024",
+        "tracker.back_end.robust_scales=[] tracker.back_end.steps=0",
+        "tracker.local_map.window=2 tracker.local_map.steps=0",
+        "mapper.insertion.median_errors=inf mapper.seed=4294967295 depth_fusion.confidence=1",
     ],
 )
 def test_the_ends_of_a_range_belong_to_it(words: str) -> None:
     assert not refusal(*words.split())
+
+
+@pytest.mark.parametrize(
+    ("words", "wanted"),
+    [
+        ("robust_scales=[1,0]", "robust_scales=(1.0, 0.0): each must be above 0"),
+        ("factors=[]", "factors=(): one at least, each above 0"),
+        ("bounds=[3,1]", "bounds=(3.0, 1.0): the lower one above 0, and below the upper one"),
+    ],
+)
+def test_a_list_of_settings_is_shown_as_a_whole(words: str, wanted: str) -> None:
+    part = "back_end" if words.startswith("robust") else "focal"
+    assert refusal(f"tracker.{part}.{words}") == f"tracker.{part}.{wanted}"
 
 
 def test_a_stage_of_stereo_is_named_by_its_place() -> None:

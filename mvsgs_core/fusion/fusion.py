@@ -14,7 +14,7 @@ from mvsgs_core.fusion.keyframe_depth import KeyframeDepth, depth_maps
 from mvsgs_core.fusion.normals import normals_of
 from mvsgs_core.keyframe_window import WindowedStage
 from mvsgs_core.pace import Effort, Pace, check_efforts, check_share
-from mvsgs_core.setting_ranges import at_least
+from mvsgs_core.setting_ranges import at_least, within
 
 ANY_DEPTH = 1.0  # relative difference that no two positive depths reach
 EFFORTS = (Effort("full", 1.0), Effort("two neighbors", 0.4), Effort("no neighbor", 0.15))
@@ -45,7 +45,7 @@ class FusionConfig:
 
     def __post_init__(self) -> None:
         at_least(self, lag=0, window=0, neighbors=0, sigma=0, sigma_most=0, violation=0, relative=0)
-        at_least(self, min_neighbor_confidence=0, confidence=0)
+        within(self, min_neighbor_confidence=(0, 1), confidence=(0, 1))
         check_share(self.share)
         check_efforts(EFFORTS, self.efforts)
 

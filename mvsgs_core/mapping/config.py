@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 from mvsgs_core.mapping.blocks.config import RefineConfig
 from mvsgs_core.mapping.density_control import DensityControlConfig
@@ -12,7 +12,7 @@ from mvsgs_core.mapping.keyframes import ConvergenceConfig
 from mvsgs_core.mapping.losses import Loss, LossWeights
 from mvsgs_core.mapping.optimizer import OptimizerConfig
 from mvsgs_core.pace import check_share
-from mvsgs_core.setting_ranges import SEEDS, at_least, within
+from mvsgs_core.setting_ranges import SEEDS, UNBOUNDED, at_least, within
 
 ITERATIONS, LIVE = 15, 30  # of a keyframe while the stream runs; in real time, where nothing waits for them
 FEWEST = 16  # keyframes that a refinement is long enough for: a map of fewer has as much to settle
@@ -60,7 +60,7 @@ class MapperConfig:
     max_keyframes: int = 10_000
     images_in_memory: int = 1000  # of them; beyond, those of older keyframes wait on disk until they are trained on
     sh_degree: int = 0  # of the view-dependent color, 0 to 3
-    seed: int = 0
+    seed: Annotated[int, UNBOUNDED] = 0
     threads: int | None = None  # of the rasterizer and the optimizer; null: all
     device: str = "auto"  # auto, cpu or cuda:0
     training: TrainingConfig = field(default_factory=TrainingConfig)

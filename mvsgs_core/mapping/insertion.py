@@ -7,6 +7,7 @@ voxel filter; here each rectangle of a partition of the image that saves enough 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from mvsgs_core.mapping.partition import Partition
 from mvsgs_core.rasterizer.kernels import neutral_beta
 from mvsgs_core.rasterizer.spherical_harmonics import from_rgb
 from mvsgs_core.rasterizer.splats import Splats
-from mvsgs_core.setting_ranges import above, at_least, within
+from mvsgs_core.setting_ranges import UNBOUNDED, above, at_least, within
 
 MIN_COSINE = 0.25  # between ray and normal: a surface seen more slantingly is not stretched further
 DOUBTFUL = 1e-3  # weight of a pixel of doubtful depth beside one of known depth
@@ -30,7 +31,8 @@ class InsertionConfig:
     # dissimilarity, as SSIM's, that a splat must mend (.11: 40 dB of a pixel amid gray ones); the noise of the view's
     # image, in the same unit, comes to it, so that it at most doubles
     price: float = 0.25
-    median_errors: float = 3.0  # times a view's median error that a pixel of the map may have: blur, noise, pose
+    # times a view's median error that a pixel of the map may have: blur, noise, pose
+    median_errors: Annotated[float, UNBOUNDED] = 3.0
     min_opacity: float = 0.7  # rendered opacity below: the map shows nothing there, whatever the color
     doubtful: bool = True  # where it shows nothing, splats of doubtful or continued depth, too; false: it stays empty
     doubtful_confidence: float = 0.6  # from which such depth counts as known, where the map shows something else

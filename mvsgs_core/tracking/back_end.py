@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mvsgs_core.setting_ranges import at_least
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solution, Solver
 from mvsgs_core.tracking.graph import KeyframeGraph
@@ -21,6 +22,11 @@ class BackEndConfig:
     steps: int = 10  # of each global bundle adjustment
     robust_scales: tuple[float, ...] = (4.0, 1.0, 0.5)  # pixels, one bundle adjustment each
     max_keyframes: int = 300  # that are adjusted at once: a larger map is in blocks, its neighbors held
+
+    def __post_init__(self) -> None:
+        at_least(self, max_edges=0, max_error=0, steps=0, max_keyframes=2)
+        if not all(scale > 0 for scale in self.robust_scales):
+            raise ValueError(f"robust_scales={self.robust_scales}: each must be above 0")
 
 
 class BackEnd:

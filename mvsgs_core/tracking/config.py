@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from mvsgs_core.setting_ranges import at_least
+from mvsgs_core.setting_ranges import at_least, within
 from mvsgs_core.tracking.back_end import BackEndConfig
 from mvsgs_core.tracking.estimation.focal import FocalConfig
 from mvsgs_core.tracking.estimation.rolling_shutter import check_readout_time
@@ -35,6 +35,7 @@ class KeyframeTrackingConfig:
 
     def __post_init__(self) -> None:
         at_least(self, area=LEAST_AREA)
+        within(self, min_texture=(0, 1))
         if self.frames_between < 0:
             raise ValueError(f"tracker.frames_between={self.frames_between}: a number of frames, 0 for none")
 
@@ -76,6 +77,7 @@ class TrackerConfig(KeyframeTrackingConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        at_least(self, tolerance=0, min_matches=0)
         check_readout_time(self.readout_time, self.reads_columns)
         if self.share is not None and not 0.0 < self.share <= 1.0:
             raise ValueError(f"tracker.share={self.share}: of a core's time, above 0 and at most 1; null: half of all")

@@ -36,6 +36,10 @@ class Diagnosis:
         """As of FrontEndConfig and TrackerConfig."""
         self.lost_fraction = lost_fraction
         self.min_texture = min_texture
+        self.begin()
+
+    def begin(self) -> None:
+        """A segment: what kept one before from starting is no reason."""
         self.blank = Measured()  # frames without texture: fraction of the cells that are textured
         self.lost = Measured()  # frames that could not be followed: fraction of the points that survived
         self.jumped = Measured()  # of these: displacement by features, where enough of them agree

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import cv2
 import numpy as np
 
+from mvsgs_core.setting_ranges import UNBOUNDED, at_least, within
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import CELL, TrackingImage
@@ -24,10 +26,15 @@ AROUND = (3, 3)  # pixels of half size about a point: no masked one is among the
 
 @dataclass(frozen=True)
 class FrontEndConfig:
-    still_flow: float = 0.00025  # of the longer side: median flow below which a frame did not move, but for noise
+    # of the longer side: median flow below which a frame did not move, but for noise
+    still_flow: Annotated[float, UNBOUNDED] = 0.00025
     feature_fraction: float = 0.5  # of the textured points: fewer found, and features are tried
     lost_fraction: float = 0.2  # fewer found: the frame is lost
     lost_inliers: float = 0.5  # of the matches, within 2 pixels of one pose: fewer, and the frame is lost
+
+    def __post_init__(self) -> None:
+        at_least(self, still_flow=0)
+        within(self, feature_fraction=(0, 1), lost_fraction=(0, 1), lost_inliers=(0, 1))
 
     def at(self, size: tuple[int, int], area: int) -> FrontEndConfig:
         """For images of a size (height, width), where these are meant for `area` pixels: of the more points that a

@@ -20,7 +20,6 @@ from mvsgs_core.tracking.session import Session
 from mvsgs_core.trajectory import TrackingState
 
 MAX_OFFSET = 0.01  # of the image's width: by which a camera's rays may miss those of the map's camera
-LOST_AT_FIRST = "frames before the camera was found in the map"
 
 
 def go_on(session: Session, known: KnownMap, frames: tuple[int, int]) -> None:
@@ -82,4 +81,4 @@ def _check_camera(session: Session, known: KnownMap, frames: tuple[int, int]) ->
         )
 
 
-__all__ = ["LOST_AT_FIRST", "go_on"]
+__all__ = ["go_on"]

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mvsgs_core.setting_ranges import at_least, within
 from mvsgs_core.tracking.diagnosis import Diagnosis
 from mvsgs_core.tracking.estimation.focal import FocalConfig, reconstructing_with_unknown_focal
 from mvsgs_core.tracking.estimation.structure_from_motion import ReconstructionCriteria, reconstructing
@@ -33,6 +34,10 @@ class InitializationConfig:
         )
     )  # at the end of the stream
 
+    def __post_init__(self) -> None:
+        at_least(self, min_keyframes=2, max_keyframes=2, flow=0, patience=1, recent=1)
+        within(self, min_fraction=(0, 1), weak_fraction=(0, 1))
+
 
 class Initializer:
     """The keyframes of a segment that has no map yet."""
@@ -48,6 +53,7 @@ class Initializer:
         self.waiting: list[int] = []
         self._weak: dict[tuple[int, int], Matches] = {}  # of pairs of them, too few for an edge
         self.diagnosis = diagnosis
+        self._segment = 0  # of the waiting keyframes
 
     @property
     def reason(self) -> str:
@@ -66,6 +72,9 @@ class Initializer:
         """`add`, an edge a step."""
         ones = np.ones(len(image.cells.points))
         earlier = list(self.waiting)
+        if segment != self._segment:
+            self._segment = segment
+            self.diagnosis.begin()
         self.graph.add(Keyframe(image, np.eye(4), ones, 0.0 * ones, segment))
         self.waiting.append(image.index)
         self.diagnosis.waiting(len(self.waiting))

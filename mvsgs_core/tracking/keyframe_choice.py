@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from mvsgs_core.held_out import is_held_out
+from mvsgs_core.setting_ranges import at_least, within
 from mvsgs_core.tracking.front_end import Step
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.keyframe_spacing import KeyframeSpacing
@@ -29,6 +30,10 @@ class KeyframeChoiceConfig:
     # of the matches, within 2 pixels of one pose: fewer make a keyframe after half the flow, well before the frame is
     # lost (front_end.lost_inliers). Beside what is near the camera, points are found to the end and agree no more.
     min_inliers: float = 0.75
+
+    def __post_init__(self) -> None:
+        at_least(self, max_flow=0)
+        within(self, min_fraction=(0, 1), min_inliers=(0, 1))
 
 
 class KeyframeChoice:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mvsgs_core import native
+from mvsgs_core.setting_ranges import above, at_least, within
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solution, Solver
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import CELL, TrackingImage
@@ -34,6 +35,11 @@ class LocalMapConfig:
     # of the textured points that an edge must have found: the few that a car still sees two keyframes later hold the
     # scale (with .25 each is tied to its neighbors alone), and below .15 they are worse ones
     min_fraction: float = 0.15
+
+    def __post_init__(self) -> None:
+        at_least(self, recent=1, proximity=0, proximity_flow=0, window=2, steps=0, tolerance=0)
+        above(self, robust_scale=0)
+        within(self, min_fraction=(0, 1))
 
 
 class LocalMap:

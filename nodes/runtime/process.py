@@ -31,7 +31,7 @@ from nodes.runtime.explained import is_explained
 from nodes.runtime.freed_memory import FreedMemory
 from nodes.runtime.inbox import Inbox, Reader
 from nodes.runtime.requests import Requests
-from nodes.runtime.runner import Runner, end_of, seed, stats_of
+from nodes.runtime.runner import Runner, end_of, exit_fails, seed, stats_of
 from nodes.runtime.signals import ABORT_SECONDS, Signals, Stopped, end_within
 from nodes.runtime.spec import Input, Spec
 from nodes.runtime.status import Status, peak_bytes
@@ -120,7 +120,9 @@ class _Process:
         self._is_source = is_source(node_type)
         seed(self._spec.seed)
         config = build(node_type.Config, parameters(self._spec), self._spec.name)
-        runner = self._runner = Runner(self._spec.name, node_type(config))
+        with exit_fails(self._spec.name):
+            node = node_type(config)
+        runner = self._runner = Runner(self._spec.name, node)
         runner.node.rest, runner.node.waiting = self._rest, self._waiting
         runner.node.kept_in = self._spec.kept_in()
         read = {given.type for given in self._spec.outputs}
@@ -171,10 +173,7 @@ class _Process:
         self.status.set(state, error=error, **details)
         end_within(ABORT_SECONDS)
         if self._runner is not None:
-            try:
-                self._runner.node.on_abort(error)
-            except Exception:
-                logging.exception("on_abort failed")
+            self._runner.abort(error)
         end_within(ABORT_SECONDS)
 
     def close(self) -> None:

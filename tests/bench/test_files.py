@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -54,4 +55,5 @@ def test_a_worker_that_crashes_or_hangs_is_told_and_replaced(tmp_path: Path, mon
         assert worker.read("ply", tmp_path / "map.ply") == {"ended": "killed by signal 9"}
         assert worker.read("ply", tmp_path / "map.ply")["frames"] == 1
         monkeypatch.setattr(files, "TIMEOUT", 0.0)
+        worker._process.send_signal(signal.SIGSTOP)  # type: ignore[union-attr]
         assert worker.read("ply", tmp_path / "map.ply") == {"ended": "not done after 0 s"}

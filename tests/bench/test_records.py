@@ -39,6 +39,14 @@ def test_repeated_runs_are_merged_with_their_spread() -> None:
     assert merged[1] == {**row("only", "word"), "spread": None}
 
 
+def test_a_figure_that_one_of_the_runs_lacks_is_none(tmp_path: Path) -> None:
+    files = [tmp_path / "a.json", tmp_path / "b.json"]
+    files[0].write_text('[{"name": "psnr", "value": null, "met": false}, {"name": "time", "value": NaN}]')
+    files[1].write_text('[{"name": "psnr", "value": 30.5, "met": true}, {"name": "time", "value": Infinity}]')
+    merged = record.merge(record.read_rows(files))
+    assert [(row["value"], row["spread"], row["met"]) for row in merged] == [(None, None, False), (None, None, None)]
+
+
 def test_a_timed_figure_is_a_median_with_its_spread_and_meets_its_goal_where_all_of_it_does() -> None:
     within, beyond = (timed("ratio", values, "x", maximum=1.5) for values in ([1.2, 1.0, 1.4], [1.2, 1.0, 1.6]))
     assert (within.value, within.spread, within.met) == (1.2, pytest.approx(0.2), True)

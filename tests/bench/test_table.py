@@ -50,6 +50,21 @@ def test_rows_go_into_a_folder_that_is_made_and_say_where_they_are_from(
     assert made.keys() == {"commit", "machine", "date"}
 
 
+def test_what_is_no_finite_number_is_null_in_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "rows.json"
+    rows = [at_least("psnr", math.nan, "dB", 20.0), timed("time", [1.0, math.nan], "s"), Row("latency", -math.inf)]
+    assert ended(monkeypatch, rows, "--json", str(file)) == 0
+
+    def refuse(name: str) -> None:
+        raise ValueError(f"{name} is no JSON")
+
+    written = json.loads(file.read_text(), parse_constant=refuse)
+    assert [(row["name"], row["value"], row["spread"]) for row in written] == [
+        ("psnr", None, None), ("time", None, None), ("latency", None, None),
+    ]  # fmt: skip
+    assert written[0]["met"] is False
+
+
 def test_a_file_that_cannot_be_written_is_refused_before_anything_is_measured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

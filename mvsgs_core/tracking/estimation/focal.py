@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mvsgs_core.setting_ranges import at_least
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, adjust
 from mvsgs_core.tracking.estimation.radial import TOGETHER
 from mvsgs_core.tracking.estimation.structure_from_motion import Reconstruction, ReconstructionCriteria, reconstructing
@@ -34,6 +35,15 @@ class FocalConfig:
     usable: float = 0.002  # or, at the limit, to be better than the guess
     doubt: float = 0.03  # standard deviation, as a fraction, above which it is warned of
     drift: float = 0.01  # fraction by which the whole stream may contradict what was used, beyond its own uncertainty
+
+    def __post_init__(self) -> None:
+        at_least(self, min_keyframes=2, max_keyframes=2, certain=0, usable=0, doubt=0, drift=0)
+        if not self.factors or not all(factor > 0 for factor in self.factors):
+            raise ValueError(f"factors={self.factors}: one at least, each above 0")
+        if not 0 < self.bounds[0] < self.bounds[1]:
+            raise ValueError(f"bounds={self.bounds}: the lower one above 0, and below the upper one")
+        if not 0 < self.probe < 1:
+            raise ValueError(f"probe={self.probe}: must be above 0 and below 1")
 
 
 def reconstructing_with_unknown_focal(

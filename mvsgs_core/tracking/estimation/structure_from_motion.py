@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mvsgs_core import geometry
+from mvsgs_core.setting_ranges import at_least
 from mvsgs_core.tracking.estimation.bundle_adjustment import Graph, Solution, Solver, adjust, reproject
 from mvsgs_core.tracking.estimation.static_points import STILL, static_weights
 from mvsgs_core.tracking.estimation.two_view_starts import two_view_poses, widest_pairs
@@ -35,6 +36,9 @@ class ReconstructionCriteria:
     min_parallax: float = 2.0  # pixels, median over the matches of the longest pair: what a rotation can't explain
     min_still: float = 0.5  # of the points, that do not seem to move
     min_baseline: float = 0.03  # largest distance of two cameras over the median depth
+
+    def __post_init__(self) -> None:
+        at_least(self, certain_cost=0, max_cost=0, min_turn_error=0, min_parallax=0, min_still=0, min_baseline=0)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mvsgs_core.setting_ranges import at_least, within
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
@@ -28,6 +29,10 @@ class CovisibilityConfig:
     min_fraction: float = 0.6  # of the old keyframe's textured points: fewer found, and too much in the image is new
     min_inliers: float = 0.8  # fraction of its matches, within 2 pixels of one pose
     max_error: float = 2.0  # pixels, median between where the map says its points are and where they are: more is drift
+
+    def __post_init__(self) -> None:
+        at_least(self, min_keyframes=0, max_flow=0, min_age=0, max_candidates=0, max_error=0)
+        within(self, min_fraction=(0, 1), min_inliers=(0, 1))
 
 
 class CovisibleKeyframes:

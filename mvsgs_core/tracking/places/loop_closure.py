@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mvsgs_core import geometry
+from mvsgs_core.setting_ranges import at_least
 from mvsgs_core.tracking.estimation.pose_graph import SimilarityEdges, scale_of
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.local_map import LocalMap
@@ -23,6 +24,9 @@ class LoopConfig:
     min_gap: int = 10  # keyframes: nearer ones are no loop
     max_disagreement: float = 0.03  # of depth, radians, half of the scale: below, the map only gains an edge
     criteria: PoseCriteria = field(default_factory=PoseCriteria)
+
+    def __post_init__(self) -> None:
+        at_least(self, max_candidates=0, min_gap=0, max_disagreement=0)
 
 
 @dataclass(frozen=True)

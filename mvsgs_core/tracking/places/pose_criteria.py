@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from mvsgs_core.setting_ranges import above, at_least, within
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.matching.flow import Matches
 from mvsgs_core.tracking.places.localization import Localization, located
@@ -23,6 +24,11 @@ class PoseCriteria:
     min_matches: int = 50  # with known depth
     min_inliers: float = 0.7  # fraction of these, within 2 pixels of the pose
     min_area: float = 0.1  # fraction of the image: hull of the inliers
+
+    def __post_init__(self) -> None:
+        at_least(self, min_matches=1)
+        above(self, min_inliers=0)
+        within(self, min_fraction=(0, 1), min_inliers=(0, 1), min_area=(0, 1))
 
     def accept(self, graph: KeyframeGraph, index: int, matches: Matches, found: Localization) -> bool:
         """Whether the matches of the points of keyframe `index` make the pose certain that was found from them."""

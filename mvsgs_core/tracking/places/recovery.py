@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
+from mvsgs_core.setting_ranges import at_least
 from mvsgs_core.tracking.frames import FrameRecord
 from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig
 from mvsgs_core.tracking.graph import KeyframeGraph
@@ -18,6 +19,9 @@ from mvsgs_core.tracking.steps import Steps, whole
 class RecoveryConfig:
     max_images: int = 400  # of frames without a pose, kept for another try in the end; the oldest goes first
     criteria: PoseCriteria = field(default_factory=PoseCriteria)
+
+    def __post_init__(self) -> None:
+        at_least(self, max_images=0)
 
 
 @dataclass

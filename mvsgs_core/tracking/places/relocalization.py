@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from mvsgs_core.setting_ranges import at_least
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.matcher import Matcher
@@ -17,6 +18,9 @@ class RelocalizationConfig:
     max_candidates: int = 3  # keyframes that a lost frame is compared with
     patience: int = 6  # lost frames in a row after which a new segment begins
     criteria: PoseCriteria = field(default_factory=PoseCriteria)
+
+    def __post_init__(self) -> None:
+        at_least(self, max_candidates=0, patience=1)
 
 
 @dataclass

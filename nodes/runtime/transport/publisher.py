@@ -170,13 +170,14 @@ class Publisher:
             self._held_back()
             self.socket.poll(HELD_BACK_MS)
             self.watch()
-        sequence, self.sent = self.sent, self.sent + 1
+        sequence = self.sent
         if self.readers[NEWEST] > 0:
             self._send(message, sequence, NEWEST, before)
         if self.readers[RELIABLE] > 0:
             self._send(message, sequence, RELIABLE, before)
         elif self._kept is not None:
             self._kept.add(encode(message, sequence, before=before, delivery=RELIABLE))
+        self.sent = sequence + 1  # not by a message that cannot be encoded: readers would miss it
         self._not_sent += 1
 
     def end(self, message: End) -> None:

@@ -43,7 +43,7 @@ def test_kept_is_what_is_sure_and_agreed_on_and_each_rejection_is_counted() -> N
 def test_what_is_counted_as_rejected_is_a_part_of_what_was_filtered() -> None:
     views = [view(k, 0.3 * x, size=SIZE) for k, x in enumerate((0, 1, -1, 1.5))]
     views[0].depth[:, 30:] = 0  # for the neighbors to fill
-    found = fuse(views[0], views[1:], replace(CONFIG, confidence=1.1), NativeFusionBackend(1))
+    found = fuse(views[0], views[1:], replace(CONFIG, confidence=1.0), NativeFusionBackend(1))
     assert found.counts["with depth"] == (found.unfiltered > 0).sum() > 2 * (views[0].depth > 0).sum()
     assert found.counts["rejected: confidence"] == found.counts["with depth"]
 

@@ -120,6 +120,17 @@ def test_enough_keyframes_are_solved_and_become_the_map() -> None:
         assert abs(np.median(ratio[keyframe.triangulated]) - 1.0) < 0.03
 
 
+def test_what_kept_an_earlier_segment_from_starting_is_no_reason() -> None:
+    made = torn(8, (0, 4, 8, 12, 16))
+    made.initialize()
+    made.abandon()
+    assert made.diagnosis.attempts
+    assert made.diagnosis.max_waiting == 5
+    made.add(image(20), 4)
+    assert made.diagnosis.attempts == {}
+    assert made.diagnosis.max_waiting == 1
+
+
 def test_fewer_keyframes_are_not_tried() -> None:
     made = moving(frames=FRAMES[:3])
     assert not made.initialize()

@@ -263,3 +263,10 @@ class Added(Bare):
 
     class Config(Kept):
         gain: float = 1.0
+
+
+class Sighted(Node):
+    """A source that knows no truth."""
+
+    def run(self) -> Iterator[Frame]:
+        yield Frame(0, 0.0, np.zeros((4, 6, 3), np.uint8), np.ones(4))
