@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from msgs import Frame
-from mvsgs_core.camera import FOCAL_RANGE, is_near_middle, same_intrinsics
+from mvsgs_core.camera import FOCAL_RANGE, is_near_middle
 from mvsgs_core.printable import printable
 from mvsgs_core.stats import Stats
 from mvsgs_core.stream_times import LATEST, StreamTimes
@@ -40,7 +40,6 @@ class StreamFrames:
         self._stamped = stamped
         self._times = StreamTimes()
         self._newest: Frame | None = None  # as it came
-        self._intrinsics: np.ndarray | None = None  # (4,) of all, once the first has come
         self._restarted = False
         self._promptest = math.inf  # s from a frame's time to its coming, by two clocks
         self._timed = 0.0  # by time.monotonic: when the last frame's delay was taken
@@ -52,8 +51,7 @@ class StreamFrames:
         self._restarted = True
 
     def accept(self, frame: Frame) -> Frame | None:
-        """The frame at a time after all before it, with the intrinsics of the first; None, with a warning, if it cannot
-        belong to the same stream."""
+        """The frame at a time after all before it; None, with a warning, if it cannot belong to the same stream."""
         wrong = self._fault(frame)
         if wrong is None:
             self.heard = time.monotonic()
@@ -62,26 +60,13 @@ class StreamFrames:
             self.refuse(placed)
             return None
         self.native, self._newest = (frame.image.shape[0], frame.image.shape[1]), frame
-        intrinsics, stamp = self._one_camera(frame), frame.stamp or _stamp(frame.timestamp)
-        return replace(frame, timestamp=placed, intrinsics=intrinsics, stamp=stamp)
+        return replace(frame, timestamp=placed, stamp=frame.stamp or _stamp(frame.timestamp))
 
     def refuse(self, why: str) -> None:
         """One that was left out."""
         self.refused = self.refused or printable(why)
         self._stats.count("unusable")
         self._stats.warn(why)
-
-    def _one_camera(self, frame: Frame) -> np.ndarray:
-        """(4,): those of the first frame, whatever comes with later ones."""
-        if self._intrinsics is None:
-            self._intrinsics = frame.intrinsics.copy()  # a view would keep the whole frame
-        elif not same_intrinsics(frame.intrinsics, self._intrinsics):
-            self._stats.count("other_intrinsics")
-            self._stats.warn(
-                f"{self._sender}'s intrinsics change between frames: those of the first are used for all; after a "
-                "zoom, or for another camera, begin another run"
-            )
-        return self._intrinsics
 
     def _placed(self, frame: Frame) -> float | str:
         """Its time in the stream, or why it has none."""
