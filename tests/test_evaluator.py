@@ -144,6 +144,8 @@ def test_true_depth_is_scored_at_the_pixels_of_a_keyframe_that_was_resampled(eva
     assert ours[0, 0] == depth[0, round(own[2] - 0.9 * INTRINSICS[2])]
     feed(evaluator)
     np.testing.assert_array_equal(evaluator.evaluation._true_depth(3), ours)
+    evaluator.evaluation.add_keyframe(3, image, 1.1 * own, depth, 1.0)  # as photographs, which keep their lens
+    np.testing.assert_array_equal(evaluator.evaluation._true_depth(3), depth)
 
 
 def test_gps_that_does_not_tell_is_said(evaluator: Evaluator) -> None:

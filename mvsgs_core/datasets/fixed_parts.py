@@ -28,6 +28,7 @@ MOST = 0.5  # of all edges: if more stay, the camera does, and something else mo
 DARK, NOISE = 40.0, 6.0  # gray levels of a bar: the most, and how much they differ
 BLACK = 16.0  # gray levels of a rim, the most: what an undistorted picture has where the lens saw nothing
 CONVEX = 0.97  # of the convex hull of what a rim leaves
+ACROSS = 0.8  # of the width or the height, which that reaches across at least
 REACH = 4  # pixels between edges of one thing
 BESIDE, STILL = 12, 3.0  # pixels from a thing and the deviation in gray levels of what is still of it, without edges
 MARGIN = 3  # pixels beside what is fixed that show some of it
@@ -174,7 +175,8 @@ def _rim(stack: np.ndarray) -> np.ndarray:
     rim = (labels == labels[0, 0])[1:-1, 1:-1]
     opposite = (rim[0].any() and rim[-1].any()) or (rim[:, 0].any() and rim[:, -1].any())
     rows, columns = np.nonzero(~rim)
-    if not opposite or not len(rows):
+    # what is not black reaches across the picture: else it is a lamp in the dark
+    if not opposite or not len(rows) or max(np.ptp(rows) / rim.shape[0], np.ptp(columns) / rim.shape[1]) < ACROSS:
         return np.zeros_like(rim)
     hull = cv2.convexHull(np.stack([columns, rows], axis=1).astype(np.int32))
     inside = cv2.fillConvexPoly(np.zeros(rim.shape, np.uint8), hull, 1)

@@ -51,6 +51,7 @@ class Evaluation:
         self._received: set[int] = set()  # frames
         self._with_depth: set[int] = set()  # keyframes whose filtered depth came
         self.size: tuple[int, int] | None = None  # height, width of the first frame
+        self._intrinsics: np.ndarray | None = None  # (4,) of the first frame
         self._truth: dict[int, np.ndarray] = {}
 
     def add_frame(
@@ -67,6 +68,7 @@ class Evaluation:
             self.started = time.perf_counter()
         self._received.add(index)
         self.size = self.size or (image.shape[0], image.shape[1])
+        self._intrinsics = intrinsics.copy() if self._intrinsics is None else self._intrinsics
         if mask is None or mask.any():
             if depth is not None and mask is not None:
                 depth = np.where(mask, depth, np.float32(0))
@@ -222,7 +224,8 @@ class Evaluation:
         size = depth.shape[0], depth.shape[1]
         if self.trajectory.distortion is None:
             ours = self._frames.mapped_intrinsics(index) / [*2 * [self.trajectory.focal_factor], 1.0, 1.0]
-            if same_intrinsics(intrinsics, ours):
+            of_first = self._intrinsics is not None and same_intrinsics(ours, self._intrinsics)
+            if same_intrinsics(intrinsics, ours) or not of_first:  # else a tracker resampled it
                 return depth
             theirs, ours = (scale_intrinsics(each, self.size, size) for each in (intrinsics, ours))
             return resampled(depth, theirs, ours, nearest=True)
