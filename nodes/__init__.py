@@ -101,7 +101,7 @@ class Node:
         return frozenset()
 
     def run(self) -> Iterator[Any]:
-        """Sources only: yields messages until the stream ends."""
+        """Sources only: yields messages until the stream ends; frames are numbered upward."""
         raise TypeError(f"{type(self).__name__} is no source: it has no run()")
 
     def on_idle(self) -> list[Any] | None:

@@ -264,8 +264,7 @@ class Tracker(TrackerNode):
         return tracked_frame_message(frame, found, intrinsics, scale, velocity, self._readout_time, self._reads_columns)
 
     def _intrinsics(self, frame: Frame) -> np.ndarray:
-        used = self.core.used_intrinsics(frame.intrinsics, (frame.image.shape[0], frame.image.shape[1]))
-        return used * [self.core.focal_factor, self.core.focal_factor, 1.0, 1.0]
+        return frame.intrinsics * [self.core.focal_factor, self.core.focal_factor, 1.0, 1.0]
 
 
 def _grows(request: Request) -> bool:

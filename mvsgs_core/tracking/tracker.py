@@ -121,12 +121,6 @@ class Tracker:
         """Whether that is the time of its columns, not of its rows."""
         return self._session is not None and self._session.graph.reads_columns
 
-    def used_intrinsics(self, came: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """(4,) that the pose of a frame (height, width) is found with, but for the focal factor: those that came with
-        it, `came`, where they are the first frame's; else the first frame's."""
-        ours = scale_intrinsics(self.session.intrinsics, self.session.size, size)
-        return came if same_intrinsics(came, ours) else ours
-
     def keyframe(self, index: int) -> Keyframe:
         return self.session.graph.keyframes[index]
 
@@ -241,7 +235,7 @@ class Tracker:
         """
         size = image.shape[0], image.shape[1]
         session = self._session or self.begin(size, intrinsics, guessed, original)
-        if self.used_intrinsics(intrinsics, size) is not intrinsics:
+        if not same_intrinsics(intrinsics, scale_intrinsics(session.intrinsics, session.size, size)):
             self.stats.warn("the intrinsics change between frames: the tracker goes on with those of the first")
         with self.stats.time("image"):
             color = session.matcher.flow.needs_color

@@ -191,15 +191,15 @@ Tracked track_point(const Pyramid& a, const Pyramid& b, float u, float v, float 
         float x = du * scale, y = dv * scale;
         const float start_x = x, start_y = y, enough = l > 0 ? 0.05f : 0.01f;
         bool inside = true;
-        float size = det;  // times the gain of b over a: it makes steps shorter, and they end in the same place
+        float divisor = det;  // times the gain of b over a: it makes steps shorter, and they end in the same place
         for (int n = 0; n < options.iterations; ++n) {
             const float at_u = u * scale + x, at_v = v * scale + y;
             float ex, ey, contrast = 0.0f;
             inside = n == 0 ? project<true>(to, b.border, at_u, at_v, t, weight, ex, ey, contrast)
                             : project<false>(to, b.border, at_u, at_v, t, weight, ex, ey, contrast);
             if (!inside) break;
-            if (n == 0) size = det * std::clamp(contrast / t.contrast, 1.0f / kMostGain, kMostGain);
-            const float step_x = (t.hyy * ex - t.hxy * ey) / size, step_y = (t.hxx * ey - t.hxy * ex) / size;
+            if (n == 0) divisor = det * std::clamp(contrast / t.contrast, 1.0f / kMostGain, kMostGain);
+            const float step_x = (t.hyy * ex - t.hxy * ey) / divisor, step_y = (t.hxx * ey - t.hxy * ex) / divisor;
             x -= step_x;
             y -= step_y;
             if (std::fabs(x - start_x) > kWindow || std::fabs(y - start_y) > kWindow) inside = false;
