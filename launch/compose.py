@@ -6,6 +6,7 @@ are. Hydra would refuse one that the file does not have, so it is given `++slot.
 
 from __future__ import annotations
 
+import os
 import shlex
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -75,7 +76,17 @@ def graph_of(config: DictConfig, overrides: Sequence[str], choices: Mapping[str,
     except OmegaConfBaseException as error:
         raise GraphError(str(error)) from error
     assert isinstance(resolved, dict)
-    return build_graph({str(key): value for key, value in resolved.items()}, replaced)
+    return build_graph({str(key): _at_home(value) for key, value in resolved.items()}, replaced)
+
+
+def _at_home(value: Any) -> Any:
+    """With ~/ at the beginning of a text as a shell has it, which leaves that alone behind a key and an equals sign."""
+    if isinstance(value, dict):
+        return {key: _at_home(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_at_home(item) for item in value]
+    # os.path's raises nothing where a user has no home
+    return os.path.expanduser(value) if isinstance(value, str) and value.startswith("~/") else value  # noqa: PTH111
 
 
 def prepare(overrides: Sequence[str], conf: Path = CONF, *, all_choices_known: bool = True) -> list[str]:

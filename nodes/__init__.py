@@ -67,6 +67,7 @@ class Node:
     # a process of it that is started again in the midst of a run goes on: it needs the newest messages, and what the
     # one before left in `kept_in`
     restartable: ClassVar[bool] = False
+    missed_kept: ClassVar[int] = 0  # messages that a newer one overtook, see `missed`
     reports: ClassVar[bool] = False  # writes report.json at the end: without it a run is not finished
     in_stream_order: ClassVar[bool] = True  # keyframes leave in the order of their indices, which resuming relies on
 
@@ -80,6 +81,8 @@ class Node:
         self.rest: Callable[[], object] = _go_on  # to be called in long work where nothing is half changed, see above
         self.kept_in: Path | None = None  # folder for what a process started in this one's place needs; None: none is
         self.waiting: Callable[[type], int] = _none  # messages of a type that came and were not taken up, about
+        # of a type of which only the newest is taken up: those that the last one overtook, oldest first, as far as kept
+        self.missed: Callable[[type], list[Any]] = _no_messages
 
     @classmethod
     def check(cls, config: Any) -> None:
@@ -121,6 +124,11 @@ def _go_on() -> None:
 def _none(kind: type) -> int:
     """Nothing waits for a node that runs in no process of its own."""
     return 0
+
+
+def _no_messages(kind: type) -> list[Any]:
+    """Nothing overtakes what is given to a node that runs in no process of its own."""
+    return []
 
 
 _OUTPUT_HOOKS: tuple[str, ...] = ("run", "on_idle", "on_end")

@@ -19,6 +19,7 @@ from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity
 from mvsgs_core.tracking.matching.flow import check_flow
 from mvsgs_core.tracking.publish import Correction, Update
 from mvsgs_core.tracking.tracker import Tracker as CoreTracker
+from nodes.catching_up import KEPT, CatchingUp
 from nodes.localization_file import LocalizationFile
 from nodes.returning import Returning
 from nodes.tracked_messages import keyframe_message, tracked_frame_message
@@ -40,6 +41,7 @@ class Tracker(TrackerNode):
     config: Config
     core: CoreTracker
     restartable: ClassVar[bool] = True
+    missed_kept: ClassVar[int] = KEPT
     only_localizes: ClassVar[bool] = False  # from the start to the end, frames are only found in the map
 
     def __init__(self, config: Config | None = None) -> None:
@@ -48,6 +50,7 @@ class Tracker(TrackerNode):
         self.core = CoreTracker(self.config, known=known, frozen=self.only_localizes)
         self._localized = LocalizationFile(self.config.output, self.stats)
         self._newest: Frame | None = None
+        self._catching_up = CatchingUp()
         self._returning: Returning | None = None
         self._readout_times: list[float] = []  # seconds, what was taken out of each keyframe's image
         self._without_shutter: set[int] = set()  # keyframes that were sent before the readout time was known
@@ -64,12 +67,26 @@ class Tracker(TrackerNode):
         if self._returning is not None and frame.index <= self._returning.newest:
             self.stats.skip("frames that came again")
             return
+        self._catching_up.came([*self.missed(Frame), frame])
+        yield from self._next_frame()
+        self._save_to_return()
+
+    def _next_frame(self) -> Iterator[Keyframe | Poses | TrackedFrame | CameraPose | TrackerPhase]:
+        """Of those that wait; what it begins is done at once where others do."""
+        frame = self._catching_up.take(self.core.phase, self._follows)
         yield from super().on_frame(frame)
         if self.core.frozen:
             self._localized.add(frame, self.core.newest_pose())
-        self._save_to_return()
+        if self._catching_up.behind:
+            self.stats.count("frames taken up late")
+            yield from self._work_for(np.inf)
 
-    def on_idle(self) -> list[Keyframe | Poses | TrackedFrame] | None:
+    def _follows(self, frame: Frame) -> bool:
+        return self.core.follows(frame.index, frame.timestamp, frame.image, frame.mask)
+
+    def on_idle(self) -> list[Keyframe | Poses | TrackedFrame | CameraPose | TrackerPhase] | None:
+        if self._catching_up.behind:
+            return list(self._next_frame())
         found = super().on_idle()
         if not found:  # what is saved was sent
             self._save_to_return()
@@ -114,7 +131,9 @@ class Tracker(TrackerNode):
             self._returning.note(request)
         yield request
 
-    def on_end(self) -> Iterator[Keyframe | Poses | TrackedFrame | Trajectory]:
+    def on_end(self) -> Iterator[Keyframe | Poses | TrackedFrame | CameraPose | TrackerPhase | Trajectory]:
+        while self._catching_up.behind:
+            yield from self._next_frame()
         yield from super().on_end()
         if self.config.keep_map and not self.only_localizes and self.config.output is not None:
             self._keep_map(self.config.output)
@@ -180,6 +199,7 @@ class Tracker(TrackerNode):
         if self._returning is not None:
             self._returning.begin(core, request.number, 0 if self._newest is None else self._newest.index + 1)
             self._returning.note_mode(core.frozen)
+        self._catching_up.forget()
         self._frames.clear()
         self._readout_times.clear()
         self._without_shutter.clear()

@@ -135,14 +135,14 @@ class TrackerNode(Node, ABC):
     def on_request(self, request: Request) -> Iterator[Keyframe | Poses | TrackedFrame | Request]:
         yield refused(request, type(self))
 
-    def on_idle(self) -> list[Keyframe | Poses | TrackedFrame] | None:
+    def on_idle(self) -> list[Keyframe | Poses | TrackedFrame | CameraPose | TrackerPhase] | None:
         if self._work is not None:
             return list(self._work_for(SLICE))
         if self._later is None:
             return None
         return [] if self._later.step() else list(self._settled())
 
-    def on_end(self) -> Iterator[Keyframe | Poses | TrackedFrame | Trajectory]:
+    def on_end(self) -> Iterator[Keyframe | Poses | TrackedFrame | CameraPose | TrackerPhase | Trajectory]:
         yield from self._work_for(np.inf)
         while self._later is not None and self._later.step():
             pass
@@ -191,6 +191,9 @@ class TrackerNode(Node, ABC):
                 update: Update = done.value
                 self._work, self._later = None, update.later
                 yield from self._send(update)
+                if update.rest is not None:
+                    yield from self._settled()
+                    self._work = update.rest
             if time.monotonic() >= until:
                 return
 

@@ -11,6 +11,11 @@ import pytest
 
 import msgs
 from msgs import CameraPose, Frame, Keyframe, TrackedFrame, TrackerPhase, Trajectory
+from mvsgs_core.tracking.phase import Phase
+from mvsgs_core.tracking.publish import Update
+from mvsgs_core.tracking.steps import whole
+from mvsgs_core.tracking.tracker import Tracker as CoreTracker
+from mvsgs_core.trajectory import TrackingState
 from nodes.tracker import Tracker
 from tests.support.sequences import synthetic
 
@@ -96,3 +101,45 @@ def test_a_live_tracker_says_now_and_then_how_late_its_poses_are() -> None:
     assert phases[0].phase == "initializing"
     assert [m.phase for m in recorded if isinstance(m, TrackerPhase)] == ["tracking"]
     assert all(m.latency is None for m in recorded if isinstance(m, TrackerPhase))
+
+
+def followed(core: CoreTracker, frame: Frame) -> Update:
+    return core.follow(frame.index, frame.timestamp, frame.image, frame.intrinsics)
+
+
+@pytest.mark.slow
+def test_a_frame_that_went_as_far_while_a_keyframe_was_worked_on_is_one_at_once() -> None:
+    core, coming = CoreTracker(), iter(frames(80))
+    for frame in coming:  # to the first keyframe after the start
+        update = followed(core, frame)
+        if update.rest is not None and core.phase is Phase.TRACKING:
+            break
+        update.whole()
+    assert update.rest is not None
+    begun, front_end = frame.index, core.session.front_end
+    while front_end.reference is None or front_end.reference.index < begun:
+        next(update.rest)
+    while not core.late:  # frames are followed from it meanwhile, to where the next may be lost
+        frame = next(coming)
+        assert followed(core, frame).rest is None
+    after = whole(update.rest)
+    assert after.keyframes == (begun,)
+    assert after.rest is not None
+    again = whole(after.rest)
+    assert again.keyframes == (frame.index,)
+    assert again.rest is None
+
+
+@pytest.mark.slow
+def test_whether_the_camera_would_be_followed_is_asked_without_a_trace() -> None:
+    given, asked = frames(60), CoreTracker()
+    tracked = [CoreTracker(), asked]
+    assert not asked.follows(0, 0.0, given[0].image), "there is no map"
+    for frame in given[:45]:
+        updates = [followed(core, frame).whole() for core in tracked]
+        if updates[1].state is TrackingState.TRACKED and frame.index < 40:
+            assert asked.follows(frame.index + 1, given[frame.index + 1].timestamp, given[frame.index + 1].image)
+            assert not asked.follows(59, given[59].timestamp, np.ascontiguousarray(given[59].image[:, ::-1]))
+    for core in tracked:
+        list(core.finish())
+    np.testing.assert_array_equal(*(core.trajectory().world_from_cam for core in tracked))

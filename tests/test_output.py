@@ -232,3 +232,11 @@ def test_a_file_in_the_way_of_the_output_is_named(tmp_path: Path) -> None:
     for path, said in ((file, "is a file"), (file / "a" / "b", f"{file} is a file")):
         with pytest.raises(GraphError, match=f"output={path}: {said}; give the name of a folder"):
             Output(path)
+
+
+def test_a_path_at_home_is_one_whatever_its_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    # no shell takes the ~ of recorder.path=~/walk.mcap as it takes that of a word of its own
+    monkeypatch.setenv("HOME", "/home/anna")
+    graph = compose(["dataset=images", "dataset.path=~/photos", "recorder=mcap", "recorder.path=~/walk.mcap"])
+    assert graph.resolved["recorder"]["path"] == "/home/anna/walk.mcap"
+    assert graph.resolved["dataset"]["path"] == "/home/anna/photos"

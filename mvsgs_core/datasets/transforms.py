@@ -46,7 +46,7 @@ def read_transforms(path: Path, images: list[Path], image_size: tuple[int, int],
         for name, frame in frames.items():
             with reading(f"frame {name!r}", "cannot be"):
                 pose = rigid(np.array(frame["transform_matrix"], dtype=np.float64), "transform_matrix")
-                said, size = {**content, **frame}, image_size
+                said, size = {**_common(content, frame), **frame}, image_size
                 if not {"h", "w"} <= said.keys() and _IN_PIXELS & frame.keys() and name in image_of:
                     size = _size_on_disk(image_of[name], image_size)
                 lens, mask = _lens(said, size), said.get("mask_path")
@@ -55,6 +55,13 @@ def read_transforms(path: Path, images: list[Path], image_size: tuple[int, int],
                     masked = inside(masks or path.parent, mask, path)
                 shots[name] = Shot(lens, pose @ OPENGL_FROM_OPENCV, masked)
     return Model("transforms.json", shots)
+
+
+def _common(content: Mapping[str, Any], frame: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What the file says of all frames, less the focal lengths where this one has an angle of view of its own."""
+    if "camera_angle_x" not in frame:
+        return content
+    return {name: value for name, value in content.items() if name not in ("fl_x", "fl_y", "camera_angle_y")}
 
 
 def _relative(name: str) -> str:

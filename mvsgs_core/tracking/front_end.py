@@ -21,6 +21,7 @@ from mvsgs_core.tracking.places.localization import Localization, localize
 FASTEST = 65504.0  # pixels a second: faster, of a timestamp that is wrong, is no number of an edge
 SAME = 6.0  # gray levels by which two images of the same view differ, in the mean
 BESIDE = 4.0  # of the flow of a frame that did not move: as much is seen beside what changes where it is masked
+SURELY = 2.0  # times as many points as of a frame that is lost: the camera is not lost in the next one
 AROUND = (3, 3)  # pixels of half size about a point: no masked one is among them, see MASK_MARGIN
 
 
@@ -149,6 +150,12 @@ class FrontEnd:
         trial = copy(self)
         trial.refer_to(image)
         return not trial.is_lost(trial.follow(other, with_pose=False))
+
+    def would_follow(self, image: TrackingImage, with_pose: bool) -> bool:
+        """Whether `follow` would find enough of the next image for the one after it to be followed, too."""
+        trial = copy(self)
+        step = trial.follow(image, with_pose)
+        return not trial.is_lost(step) and step.fraction >= SURELY * self.config.lost_fraction
 
     def is_lost(self, step: Step) -> bool:
         """Too few points found, or no pose that they agree on."""

@@ -107,6 +107,11 @@ class Tail:
     def add(self, frame: TrackingImage, step: Step) -> None:
         self._frames = dict(sorted(self._frames.items())[-1:]) | {frame.index: (frame, step)}
 
+    def newest_after(self, index: int) -> tuple[TrackingImage, Step] | None:
+        """The newer one, where it came after the frame `index`."""
+        newest_one = max(self._frames, default=-1)
+        return self._frames[newest_one] if newest_one > index else None
+
     def last(self, choice: KeyframeChoice) -> tuple[TrackingImage, Step] | None:
         """The one that is to be a keyframe at the end of the stream; None where neither shows enough."""
         shown = {i: (f, s) for i, (f, s) in self._frames.items() if choice.shows_new(s, f.longer_side)}

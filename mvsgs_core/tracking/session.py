@@ -6,12 +6,13 @@
 
 Semi-dense matches (flow.py) of the newest keyframe give each frame's pose; keyframes join a graph (local_map.py) that
 dense bundle adjustment keeps consistent; loops (loop_closure.py) correct or join. That work is done in steps, between
-which frames may come: they are followed from the keyframe before, and none of them becomes a keyframe.
+which frames may come: they are followed from the keyframe before, and none of them becomes a keyframe before its end.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -54,8 +55,7 @@ class Session:
         """size (height, width), intrinsics (4,): of the frames as they come; guessed: the focal length is."""
         threads = config.threads or 1
         self.config, self.stats = config, stats
-        self.phase = Phase.INITIALIZING
-        self.segment = 0
+        self.phase, self.segment = Phase.INITIALIZING, 0
         self.records: list[FrameRecord] = []
         self.size = tracking_size(*size, config.area)
         self.intrinsics = scale_intrinsics(intrinsics, size, self.size)
@@ -108,11 +108,6 @@ class Session:
             return waiting | self._tail.indices
         # the end of the stream may force an initialization with one, the next frame may begin one with the other
         return waiting | {frame.index for frame in (self.front_end.last, self._missed) if frame is not None}
-
-    @property
-    def members(self) -> list[int]:
-        """Keyframes of the segment that the camera is in, in order."""
-        return self.local_map.members(self.segment)
 
     def last_keyframes(self) -> Iterator[Update]:
         """The stream has ended: an initialization by force if there was none, else a keyframe of the last frames."""
@@ -189,9 +184,14 @@ class Session:
         return Update(record.state, rest=self._until_done(steps))
 
     def _until_done(self, steps: Steps[Update]) -> Steps[Update]:
-        update = yield from steps
+        """Where a frame that came meanwhile is as far away as the next one may be, it is a keyframe at once, too."""
+        update, worked_on = (yield from steps), max(self._at_work)
         self._at_work, self.late = frozenset(), False
-        return update
+        came = self._tail.newest_after(worked_on)
+        if came is None or not self.choice.is_late(came[1], came[0].longer_side, self.choice.max_flow):
+            return update
+        record = record_of(self.records, came[0].index)
+        return replace(update, rest=self._begin_work(came[0], record, self._add_keyframe(*came, record)).rest)
 
     # INITIALIZING
 

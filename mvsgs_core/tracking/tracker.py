@@ -238,8 +238,7 @@ class Tracker:
         if not same_intrinsics(intrinsics, scale_intrinsics(session.intrinsics, session.size, size)):
             self.stats.warn("the intrinsics change between frames: the tracker goes on with those of the first")
         with self.stats.time("image"):
-            color = session.matcher.flow.needs_color
-            frame = TrackingImage.of(index, timestamp, image, session.size, color, exposure, mask)
+            frame = self._image(session, index, timestamp, image, exposure, mask)
         self.stats.count("frames")
         update = session.add(frame)
         if self._seeking and session.phase in (Phase.INITIALIZING, Phase.TRACKING):
@@ -247,6 +246,18 @@ class Tracker:
             if session.phase is Phase.INITIALIZING:
                 self.stats.warn(NOT_FOUND)
         return update
+
+    def follows(self, index: int, timestamp: float, image: np.ndarray, mask: np.ndarray | None = None) -> bool:
+        """Whether the camera would be followed to this frame, were it the next, as surely as from frame to frame.
+
+        Of a live stream some of whose frames were passed over; parameters as of `follow`. Nothing changes. False before
+        there is a map and where the camera is lost.
+        """
+        session = self._session
+        if session is None or session.phase is not Phase.TRACKING:
+            return False
+        frame = self._image(session, index, timestamp, image, 0.0, mask)
+        return session.front_end.would_follow(frame, with_pose=True)
 
     def finish(self) -> Iterator[Update]:
         """The stream has ended: last keyframes, global bundle adjustment, every frame's pose, and what to warn of."""
@@ -293,6 +304,13 @@ class Tracker:
         yield Update(state, correction=correction)
         if not self._frozen:  # after what the map waits for
             session.calibration.check(session.local_map.largest())
+
+    def _image(
+        self, session: Session, index: int, timestamp: float, image: np.ndarray, exposure: float,
+        mask: np.ndarray | None,
+    ) -> TrackingImage:  # fmt: skip
+        color = session.matcher.flow.needs_color
+        return TrackingImage.of(index, timestamp, image, session.size, color, exposure, mask)
 
 
 __all__ = ["Tracker", "TrackerConfig", "Update"]

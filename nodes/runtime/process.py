@@ -109,7 +109,7 @@ class _Process:
         self._step = _Step()
         self._freed = FreedMemory()
         self._runner: Runner | None = None
-        self._is_source = False
+        self._is_source, self._missed_kept = False, 0
         self._readers: list[Reader] = []
         self._publishers: dict[str, Publisher] = {}  # by message type
         self.status = Status(spec.status_fd, self._snapshot)
@@ -117,13 +117,13 @@ class _Process:
     def run(self) -> None:
         self.status.set("starting")
         node_type = load_node(self._spec.target)
-        self._is_source = is_source(node_type)
+        self._is_source, self._missed_kept = is_source(node_type), node_type.missed_kept
         seed(self._spec.seed)
         config = build(node_type.Config, parameters(self._spec), self._spec.name)
         with exit_fails(self._spec.name):
             node = node_type(config)
         runner = self._runner = Runner(self._spec.name, node)
-        runner.node.rest, runner.node.waiting = self._rest, self._waiting
+        runner.node.rest, runner.node.waiting, runner.node.missed = self._rest, self._waiting, self._missed
         runner.node.kept_in = self._spec.kept_in()
         read = {given.type for given in self._spec.outputs}
         runner.node.unread = frozenset(sent for sent in outputs(node_type) if sent.__name__ not in read)
@@ -167,6 +167,10 @@ class _Process:
 
     def _waiting(self, kind: type) -> int:
         return sum(reader.waiting for reader in self._readers if reader.type_name == kind.__name__)
+
+    def _missed(self, kind: type) -> list[Message]:
+        of_kind = (r for r in self._readers if isinstance(r, NewestReader) and r.type_name == kind.__name__)
+        return [message for reader in of_kind for message in reader.missed()]
 
     def abort(self, state: str, error: str, **details: Any) -> None:
         """Tells the launcher, then lets the node save what it has."""
@@ -217,7 +221,10 @@ class _Process:
         for i in inputs:
             kind = msgs.TYPES[i.type]
             if i.best_effort:
-                reader: Reader = NewestReader(i.address, kind, topic=i.topic, observer=observer, away=i.away, **shared)
+                reader: Reader = NewestReader(
+                    i.address, kind, topic=i.topic, missed_kept=self._missed_kept, observer=observer, away=i.away,
+                    **shared,
+                )  # fmt: skip
             else:
                 reader = ReliableReader(
                     i.address, kind, topic=i.topic, buffer=spec.buffer, observer=observer, away=i.away,

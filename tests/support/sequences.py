@@ -38,6 +38,11 @@ def tracked_room() -> tuple[Tracker, Trajectory, list[Update]]:
     return track(synthetic(frames=80))
 
 
+def members_of(tracker: Tracker) -> list[int]:
+    """Keyframes of the part of the map that the camera is in, in order."""
+    return tracker.session.local_map.members(tracker.session.segment)
+
+
 def ate(trajectory: Trajectory, items: Sequence[Item], chosen: np.ndarray | None = None) -> tuple[float, float]:
     """RMS position error after Sim(3) alignment over all frames with a pose, and the length of the true trajectory."""
     truth = {i.index: i.world_from_cam for i in items}

@@ -7,6 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import zmq
@@ -257,9 +258,13 @@ class NewestReader(_Reader):
 
     delivery = NEWEST
 
-    def __init__(self, address: str, type: type, **options: Any) -> None:
+    def __init__(self, address: str, type: type, *, missed_kept: int = 0, **options: Any) -> None:
+        """missed_kept: of the messages that newer ones overtook, so many are there for who asks for them."""
         super().__init__(address, type, buffer=2, **options)
         self._frames = deque(maxlen=1)  # a newer one takes the older one's place
+        self._overtaken: deque[zmq.Frame] = deque(maxlen=missed_kept)  # since the last one was taken
+        self._missed: list[zmq.Frame] = []  # before it
+        self._changing = threading.Lock()  # the newest, and those that it overtook
         self._odd: deque[zmq.Frame] = deque(maxlen=1)  # what took no message's place, to be reported
         self.displaced = 0  # messages that a newer one replaced before they were taken
         self._end: zmq.Frame | None = None
@@ -281,10 +286,13 @@ class NewestReader(_Reader):
         while self.pollable.poll(0):
             self.pollable.recv()
         frame: zmq.Frame | None
-        try:
-            frame = self._frames.popleft()
-        except IndexError:
-            frame, self._end = self._end, None
+        with self._changing:
+            if self._frames:
+                frame = self._frames.popleft()
+                self._missed = list(self._overtaken)
+                self._overtaken.clear()
+            else:
+                frame, self._end = self._end, None
         if frame is None and self._odd:
             frame = self._odd.popleft()
         if frame is None or self.ended:
@@ -293,6 +301,14 @@ class NewestReader(_Reader):
         self._count(message)
         self._note(sequence)
         return message
+
+    def missed(self) -> list[Message]:
+        """What the message that was taken last overtook, oldest first; nothing when asked again."""
+        frames, self._missed, found = self._missed, [], []
+        for frame in frames:
+            with suppress(CodecError):  # what is no message was overtaken as well
+                found.append(self._decode(frame).message)
+        return found
 
     def receive(self, timeout_s: float | None = None) -> Message | None:
         """Waits for a message that was not taken yet: the newest, or End; None when none comes in time.
@@ -345,8 +361,10 @@ class NewestReader(_Reader):
             elif not self._accepts(frame):
                 self._odd.append(frame)
             else:
-                self.displaced += len(self._frames)
-                self._frames.append(frame)
+                with self._changing:
+                    self.displaced += len(self._frames)
+                    self._overtaken.extend(self._frames)
+                    self._frames.append(frame)
             self._tell()
         self._wake.close()
 

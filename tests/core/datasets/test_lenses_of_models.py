@@ -61,3 +61,10 @@ def test_a_principal_point_of_other_images_is_doubted_once(tmp_path: Path) -> No
     (tmp_path / "sparse/0/cameras.txt").write_text("1 PINHOLE 64 48 50 51 24 32\n")
     (told,) = open_dataset("images", path=tmp_path).warnings
     assert told.startswith("COLMAP model: the principal point cx, cy = 23.5, 31.5 is that of images of 48x64")
+
+
+def test_the_angle_of_view_of_a_frame_counts_before_the_focal_length_of_all(tmp_path: Path) -> None:
+    write_photos(tmp_path / "images", 2)
+    write_transforms(tmp_path, [{"camera_angle_x": np.pi / 2}, {}], fl_x=50.0, fl_y=51.0)
+    focal = [item.intrinsics[:2].tolist() for item in open_dataset("images", path=tmp_path)]
+    assert focal == [pytest.approx([32.0, 32.0]), [50.0, 51.0]]

@@ -11,7 +11,7 @@ from mvsgs_core.tracking.phase import Phase
 from mvsgs_core.tracking.steps import Steps
 from mvsgs_core.tracking.tracker import Tracker
 from mvsgs_core.trajectory import TrackingState
-from tests.support.sequences import synthetic
+from tests.support.sequences import members_of, synthetic
 
 pytestmark = pytest.mark.slow
 
@@ -130,8 +130,8 @@ def test_background_work_that_fails_is_counted_and_told(monkeypatch: pytest.Monk
         return "in a test"
 
     monkeypatch.setattr(tracker.session.back_end, "working", failing)
-    before = len(tracker.session.members)
+    before = len(members_of(tracker))
     for number in range(30, 40):
         add(tracker, number)
-    assert tracker.stats.counts[FAILED] == len(tracker.session.members) - before > 0
+    assert tracker.stats.counts[FAILED] == len(members_of(tracker)) - before > 0
     assert list(tracker.stats.warnings) == ["background bundle adjustment failed: in a test"]

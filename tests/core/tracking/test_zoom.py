@@ -13,7 +13,7 @@ from mvsgs_core.datasets import Item, open_dataset
 from mvsgs_core.datasets.lens import guess_lens
 from mvsgs_core.tracking.estimation.zoom import ALONE, CLEAR, PART, Part, Zoom, clear_zoom, find_zoom
 from mvsgs_core.tracking.tracker import Tracker
-from tests.support.sequences import synthetic, tracked_room
+from tests.support.sequences import members_of, synthetic, tracked_room
 from tests.support.shared_data import shared
 
 pytestmark = pytest.mark.slow
@@ -53,7 +53,7 @@ def room() -> tuple[Item, ...]:
 
 def test_a_camera_that_does_not_zoom_is_not_said_to() -> None:
     tracker = tracked_room()[0]
-    graph, members = tracker.session.graph, tracker.session.members
+    graph, members = tracker.session.graph, members_of(tracker)
     assert len(members) >= 2 * PART
     before = {index: graph.keyframes[index].cam_from_world.copy() for index in members}
     assert find_zoom(graph, members, FOCAL, 1) is None
