@@ -101,8 +101,8 @@ def live() -> str:
     return (
         f"99 % of the poses come within {span(poses)} ms of their frames' capture. All keyframes get into the map, in "
         f"the median {span(mapped, 1)} s after their capture, 99 % within {span(latest, 1)} s. The map is at most "
-        f"{max(lost):.1f} dB below the unhurried one two seconds after the last, and within {max(refined):.1f} dB of it "
-        "once refined"
+        f"{max(lost):.1f} dB below the unhurried one two seconds after the last, and within {max(refined):.1f} dB of "
+        "it once refined"
     )
 
 
