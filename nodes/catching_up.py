@@ -19,6 +19,7 @@ class CatchingUp:
     """The frames that wait."""
 
     def __init__(self) -> None:
+        self.passed_over = 0  # frames that were never taken
         self._frames: list[Frame] = []
         self._in_order = False
 
@@ -29,7 +30,9 @@ class CatchingUp:
 
     def came(self, frames: Sequence[Frame]) -> None:
         """The newest frame, behind those that it overtook."""
-        self._frames = [*self._frames, *frames][-KEPT:]
+        waiting = [*self._frames, *frames]
+        self.passed_over += max(0, len(waiting) - KEPT)
+        self._frames = waiting[-KEPT:]
 
     def take(self, phase: Phase, follows: Callable[[Frame], bool]) -> Frame:
         """The one that is next; those before it are passed over. At least one waits.
@@ -43,11 +46,13 @@ class CatchingUp:
         elif not begins and not self._in_order:
             self._in_order = not follows(frames[-1])
         taken = 1 + (len(frames) - 1) // HOP if begins or self._in_order else len(frames)
+        self.passed_over += taken - 1
         self._frames = frames[taken:]
         return frames[taken - 1]
 
     def forget(self) -> None:
         """Another map begins."""
+        self.passed_over += len(self._frames)
         self._frames = []
 
 

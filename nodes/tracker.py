@@ -25,6 +25,7 @@ from nodes.returning import Returning
 from nodes.tracked_messages import keyframe_message, tracked_frame_message
 from nodes.tracking import TrackerNode
 
+PASSED_OVER = "frames that newer ones overtook: not tracked"
 ONLY_LOCALIZES = "this run only localizes: begin one with map=DIR and without mapper=frozen, and switch by localize"
 
 
@@ -74,6 +75,8 @@ class Tracker(TrackerNode):
     def _next_frame(self) -> Iterator[Keyframe | Poses | TrackedFrame | CameraPose | TrackerPhase]:
         """Of those that wait; what it begins is done at once where others do."""
         frame = self._catching_up.take(self.core.phase, self._follows)
+        if self._catching_up.passed_over:
+            self.stats.skipped[PASSED_OVER] = self._catching_up.passed_over
         yield from super().on_frame(frame)
         if self.core.frozen:
             self._localized.add(frame, self.core.newest_pose())

@@ -14,7 +14,7 @@ from nodes.catching_up import HOP, KEPT, CatchingUp
 from nodes.reader import Reader
 from nodes.runtime.transport.publisher import Publisher
 from nodes.runtime.transport.readers import NewestReader
-from nodes.tracker import Tracker
+from nodes.tracker import PASSED_OVER, Tracker
 from tests.support.patience import LONG, until
 from tests.support.shared_data import shared
 
@@ -76,6 +76,7 @@ def test_the_more_wait_the_more_are_passed_over_and_the_oldest_are_let_go() -> N
     found = taken(waiting, Phase.TRACKING, never)
     steps = np.diff([9, *found])
     assert found[-1] == KEPT + 9
+    assert waiting.passed_over == KEPT + 10 - len(found)
     assert steps[0] == 1 + (KEPT - 1) // HOP
     assert (np.diff(steps) <= 0).all()
     assert steps[-1] == 1
@@ -111,6 +112,7 @@ def test_a_head_that_turns_while_the_start_is_solved_is_followed_on() -> None:
     assert node.core.phase is Phase.TRACKING
     assert "relocalized" not in node.stats.counts
     assert node.stats.counts["frames taken up late"] > 3
+    assert node.stats.skipped[PASSED_OVER] == 45 - node.stats.counts["frames"]
     assert set(trajectory.segment.tolist()) == {0}
     assert np.isfinite(trajectory.world_from_cam[SOLVED:]).all()
     node, trajectory = on_hololens(missed=False)
@@ -133,7 +135,8 @@ def test_a_reader_of_the_newest_keeps_what_that_overtook(tmp_path: Path, kept: i
         until(lambda: reader.waiting == 1)
         assert [m.index for m in reader.missed() if isinstance(m, Frame)] == list(range(5))[5 - min(kept, 5) :]
         assert reader.missed() == []
-        assert reader.skipped == 5
+        assert reader.skipped == 5 - min(kept, 5), "what was given out is read"
+        assert reader.received == 1 + min(kept, 5)
         assert isinstance(reader.receive(LONG), Frame)
         assert reader.missed() == []
     finally:

@@ -153,8 +153,13 @@ class FrontEnd:
 
     def would_follow(self, image: TrackingImage, with_pose: bool) -> bool:
         """Whether `follow` would find enough of the next image for the one after it to be followed, too."""
-        trial = copy(self)
+        trial, last = copy(self), self.last
+        assert last is not None
+        velocity = last.velocity
         step = trial.follow(image, with_pose)
+        if last.velocity is not velocity:  # it is for the next one to say
+            last.velocity = velocity
+            last.__dict__.pop("cell_velocity", None)
         return not trial.is_lost(step) and step.fraction >= SURELY * self.config.lost_fraction
 
     def is_lost(self, step: Step) -> bool:

@@ -303,11 +303,13 @@ class NewestReader(_Reader):
         return message
 
     def missed(self) -> list[Message]:
-        """What the message that was taken last overtook, oldest first; nothing when asked again."""
+        """What the message that was taken last overtook, oldest first; nothing when asked again. It counts as read."""
         frames, self._missed, found = self._missed, [], []
         for frame in frames:
             with suppress(CodecError):  # what is no message was overtaken as well
                 found.append(self._decode(frame).message)
+        self.received += len(found)
+        self.skipped -= len(found)
         return found
 
     def receive(self, timeout_s: float | None = None) -> Message | None:
