@@ -13,7 +13,7 @@ from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.between import Between, exposure_from, spared
 from mvsgs_core.tracking.config import PosedConfig
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, reproject
-from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig
+from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig, Step
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage, tracking_size
 from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, Tail
@@ -88,7 +88,8 @@ class PosedTracker:
         if self.front_end.is_lost(step):
             return self._insert(frame, pose, {}) if self._shows_another_place(frame, pose) else []
         self._lights[-1] = FrameLight(index, observed(self.graph, step.reference, frame, step.matches))
-        if not self.choice.wants(index, step, frame.longer_side, self.config.keyframe_choice.max_flow):
+        wanted = self.choice.wants(index, step, frame.longer_side, self.config.keyframe_choice.max_flow)
+        if not wanted and not self._moved_past(step, frame, pose):
             only = len(self.graph.keyframes) == 1
             if only and is_held_out(step.reference) and not is_held_out(index):  # this one is as good
                 self.graph.remove(step.reference)
@@ -152,6 +153,14 @@ class PosedTracker:
         if self._undecided:  # how far anything is
             return not np.array_equal(pose, self.graph.keyframes[last].cam_from_world)
         return bool(np.abs(pose @ self.graph.world_from_cam(last) - np.eye(4)).max() > STAYED)
+
+    def _moved_past(self, step: Step, frame: TrackingImage, pose: np.ndarray) -> bool:
+        """Whether what is near moves in the image by what makes a keyframe but for the camera's turning, which may keep
+        what it circles in the middle. Not of a frame that is held out: no pose can be lost."""
+        if is_held_out(frame.index) or not step.matches.alive.any():
+            return False
+        reference = self.graph.keyframes[step.reference]
+        return self._error(reference, pose, step.matches, 0.0) > self.choice.max_flow * frame.longer_side
 
     def _wait(self, reference: int, frame: _Waiting) -> None:
         if self.config.frames_between == 0 or is_held_out(frame.image.index):

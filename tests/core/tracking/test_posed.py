@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.tracking.config import PosedConfig
+from mvsgs_core.tracking.front_end import Step
 from mvsgs_core.tracking.posed import PosedTracker
 from tests.support.sequences import synthetic
 
@@ -150,6 +152,24 @@ def test_a_camera_that_turns_before_it_moves_gives_depths_once_it_moves(factor: 
     assert tracker.unit == pytest.approx(factor * DISTANCE, rel=0.1)
     assert last.triangulated.mean() > 0.8
     assert last.median_depth == pytest.approx(factor * DISTANCE, rel=0.06)
+
+
+def test_a_camera_that_keeps_what_it_circles_in_the_middle_makes_keyframes() -> None:
+    tracker, flows = PosedTracker(PosedConfig(), (HEIGHT, WIDTH), INTRINSICS), []
+    follow = tracker.front_end.follow
+
+    def watched(*arguments: Any, **options: Any) -> Step:
+        flows.append((step := follow(*arguments, **options)).flow)
+        return step
+
+    tracker.front_end.follow = watched  # type: ignore[method-assign]
+    for index in range(1, 12):
+        x = 0.3 * (index - 6)  # what stands still in the middle of the wall shifts by 30 pixels a frame beside it
+        camera = pose(-float(np.arctan2(x, DISTANCE)), x)
+        tracker.add(index, index / 30.0, view(camera), camera)
+    limit = tracker.config.keyframe_choice.max_flow * WIDTH
+    assert max(flows) < limit, "else the flow makes the keyframes"
+    assert list(tracker.graph.keyframes) == [index for index in range(1, 12) if not is_held_out(index)]
 
 
 @pytest.mark.parametrize("decided", [False, True], ids=["at the start", "later"])
