@@ -88,8 +88,7 @@ class PosedTracker:
         if self.front_end.is_lost(step):
             return self._insert(frame, pose, {}) if self._shows_another_place(frame, pose) else []
         self._lights[-1] = FrameLight(index, observed(self.graph, step.reference, frame, step.matches))
-        wanted = self.choice.wants(index, step, frame.longer_side, self.config.keyframe_choice.max_flow)
-        if not wanted and not self._moved_past(step, frame, pose):
+        if is_held_out(index) or not self._moved(step, frame, pose):
             only = len(self.graph.keyframes) == 1
             if only and is_held_out(step.reference) and not is_held_out(index):  # this one is as good
                 self.graph.remove(step.reference)
@@ -154,13 +153,14 @@ class PosedTracker:
             return not np.array_equal(pose, self.graph.keyframes[last].cam_from_world)
         return bool(np.abs(pose @ self.graph.world_from_cam(last) - np.eye(4)).max() > STAYED)
 
-    def _moved_past(self, step: Step, frame: TrackingImage, pose: np.ndarray) -> bool:
-        """Whether what is near moves in the image by what makes a keyframe but for the camera's turning, which may keep
-        what it circles in the middle. Not of a frame that is held out: no pose can be lost."""
-        if is_held_out(frame.index) or not step.matches.alive.any():
-            return False
-        reference = self.graph.keyframes[step.reference]
-        return self._error(reference, pose, step.matches, 0.0) > self.choice.max_flow * frame.longer_side
+    def _moved(self, step: Step, frame: TrackingImage, pose: np.ndarray) -> bool:
+        """Whether the image has changed enough since the reference, or would have without the camera's turning, which
+        may keep what it circles in the middle."""
+        limit, side = self.config.keyframe_choice.max_flow, frame.longer_side
+        if self.choice.moved(step, side, limit):
+            return True
+        reference, found = self.graph.keyframes[step.reference], step.matches
+        return bool(found.alive.any()) and self._error(reference, pose, found, 0.0) > limit * side
 
     def _wait(self, reference: int, frame: _Waiting) -> None:
         if self.config.frames_between == 0 or is_held_out(frame.image.index):

@@ -69,12 +69,12 @@ def test_of_a_camera_that_stands_two_poses_are_kept() -> None:
     assert set(tracker._poses) == tracker._tail.indices == {10, 11}
 
 
-def test_a_held_out_frame_that_had_to_be_a_keyframe_stays_one_where_the_camera_brakes() -> None:
+def test_the_frame_after_a_held_out_one_is_the_keyframe_however_far_the_camera_has_moved() -> None:
     tracker = PosedTracker(PosedConfig(), (HEIGHT, WIDTH), INTRINSICS)
     for index, x in [(3, 0.0), (4, 0.15), (5, 0.35), (6, 0.36), (7, 0.37)]:
         tracker.add(index, index / 30.0, view(pose(0.0, x)), pose(0.0, x))
-    assert list(tracker.graph.keyframes) == [3, 5]
-    assert tracker.keyframe(5).triangulated.mean() > 0.5
+    assert list(tracker.graph.keyframes) == [3, 6]
+    assert tracker.keyframe(6).triangulated.mean() > 0.5
     assert tracker.stats.counts["keyframes"] == 2
 
 
