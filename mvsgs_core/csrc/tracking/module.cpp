@@ -15,6 +15,7 @@
 #include "lucas_kanade.hpp"
 #include "nearest.hpp"
 #include "optimize.hpp"
+#include "sparse_module.hpp"
 
 using namespace bindings;
 using namespace mvsgs;
@@ -182,6 +183,7 @@ NB_MODULE(MVSGS_MODULE, m) {
     m.def("lucas_kanade", &lucas_kanade, nb::arg("a"), nb::arg("b"), nb::arg("points"), nb::arg("guess"),
           nb::arg("border"), nb::arg("start_level"), nb::arg("iterations"), nb::arg("window_sigma"),
           nb::arg("min_eigenvalue"), nb::arg("threads"));
+    define_sparse_adjustment(m);
     m.def("solve_positive_definite", &solve_positive_definite, nb::arg("a"), nb::arg("b"));
     m.def("match_binary", &match_binary, nb::arg("a"), nb::arg("b"), nb::arg("limit"), nb::arg("ratio"));
     m.def("median_of_nearest", &median_of_nearest, nb::arg("points"), nb::arg("values"), nb::arg("queries"),

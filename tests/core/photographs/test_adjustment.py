@@ -7,15 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvsgs_core import geometry
+from mvsgs_core import geometry, native
 from mvsgs_core.photographs.adjustment import (
     DISTORTION_SIGMA,
     FOCAL_SIGMA,
     SparseProblem,
     _cost,
-    _jacobians,
     _Normal,
-    _structure,
+    _observations,
     adjust_sparse,
     reprojection,
 )
@@ -62,7 +61,7 @@ def dense_jacobian(start: SparseProblem) -> np.ndarray:
 def test_derivatives_are_those_of_the_projection() -> None:
     start = problem(3, 8)
     start = replace(start, lens=replace(start.lens, k1=-0.1, k2=0.05))
-    of_pose, of_point, of_lens = _jacobians(start)
+    of_pose, of_point, of_lens = native.load("tracking").sparse_derivatives(**_observations(start))
     dense = dense_jacobian(start).reshape(len(start.point), 2, -1)
     poses = 6 * len(start.cam_from_world)
     for n, (photograph, point) in enumerate(zip(start.photograph, start.point)):
@@ -94,7 +93,7 @@ def test_a_step_is_that_of_the_whole_normal_equations() -> None:
     added[reduced_index, reduced_index] = damping * np.diag(reduced)
     wanted = np.zeros(len(gradient))
     wanted[free] = np.linalg.solve((hessian + added)[np.ix_(free, free)], gradient[free])
-    found = _Normal(start, _structure(start), scale).step(damping)
+    found = _Normal(start, scale).step(damping)
     assert found is not None
     expected = moved(start, wanted)
     np.testing.assert_allclose(found.cam_from_world, expected.cam_from_world, atol=2e-4)
@@ -145,8 +144,20 @@ def test_the_cost_never_rises() -> None:
         cost = now
 
 
+def test_a_point_that_no_photograph_sees_stays_where_it_is() -> None:
+    start = problem()
+    unseen = replace(start, points=np.concatenate([start.points, [[7.0, 8.0, 9.0]]]))
+    found = adjust_sparse(unseen, 5, 1.0)
+    np.testing.assert_array_equal(found.points[-1], [7.0, 8.0, 9.0])
+    np.testing.assert_array_equal(found.points[:-1], adjust_sparse(start, 5, 1.0).points)
+
+
 def test_bad_input_is_refused() -> None:
     start = problem()
+    with pytest.raises(ValueError, match="photographs and points that are there"):
+        adjust_sparse(replace(start, point=start.point + 1), 1, 1.0)
+    with pytest.raises(ValueError, match="photographs and points that are there"):
+        adjust_sparse(replace(start, photograph=start.photograph - 1), 1, 1.0)
     with pytest.raises(ValueError, match="sorted by point"):
         adjust_sparse(replace(start, point=start.point[::-1]), 1, 1.0)
     with pytest.raises(ValueError, match="points is not finite"):
