@@ -118,10 +118,7 @@ def beside(name: str, items: Sequence[Item], ours: Solved, theirs: ColmapModel |
         return [Row(f"{name}: COLMAP", why)]
     rows = [Row(f"{name}: photographs with a pose, COLMAP", f"{len(theirs.index)} of {len(items)}")]
     if ours.models:
-        mine = positions(ours.models[0])[theirs.index]
-        both = np.isfinite(mine[:, 0])
-        if both.sum() >= 3:
-            error = position_error(mine[both], theirs.world_from_cam[both, :3, 3])
+        if (error := from_theirs(ours, theirs)) is not None:
             rows.append(at_most(f"{name}: position error", error, "% of the path", MAX_ERROR))
         off = 100.0 * (ours.models[0].lens.focal(0) / theirs.focal - 1.0)
         rows.append(Row(f"{name}: focal length, from COLMAP's", off, "%"))
@@ -130,6 +127,15 @@ def beside(name: str, items: Sequence[Item], ours: Solved, theirs: ColmapModel |
     ratio = ours.seconds / theirs.solving_seconds
     rows.append(at_most(f"{name}: processor time over COLMAP's", ratio, "", MAX_TIME))
     return rows
+
+
+def from_theirs(ours: Solved, theirs: ColmapModel) -> float | None:
+    """Position error of our largest model; None where three photographs have no pose in both."""
+    if not ours.models:
+        return None
+    mine = positions(ours.models[0])[theirs.index]
+    both = np.isfinite(mine[:, 0])
+    return position_error(mine[both], theirs.world_from_cam[both, :3, 3]) if both.sum() >= 3 else None
 
 
 def scene(name: str, both_orders: bool) -> list[Row]:
@@ -143,6 +149,8 @@ def scene(name: str, both_orders: bool) -> list[Row]:
     if both_orders and theirs is not None:
         again, why = solve_with_colmap(items, order)
         rows += apart(name, theirs, again) if again is not None else [Row(f"{name}: COLMAP, shuffled", why)]
+        if again is not None and (error := from_theirs(ours, again)) is not None:
+            rows.append(Row(f"{name}: position error, from COLMAP's shuffled", error, "% of the path"))
     return rows
 
 
