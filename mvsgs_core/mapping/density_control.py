@@ -28,11 +28,12 @@ class DensityControlConfig:
     gradient: float = 6.0e-4  # mean screen gradient, in half image widths, above which a splat is cloned or split
     split_scale: float = 0.01  # standard deviation in median depths above which it is split, not cloned
     prune_opacity: float = 0.02  # 0 to 1; below: removed
+    in_the_air: float = 0.1  # of the depth that most keyframes see: splats so much nearer go at the end; 0: none does
     needless: float = 0.02  # of the keyframes' squared error that splats taken out at the end may add; 0: none are
     max_splats: int = 1_000_000  # no growth beyond
 
     def __post_init__(self) -> None:
-        at_least(self, gradient=0, split_scale=0, needless=0, max_splats=1)
+        at_least(self, gradient=0, split_scale=0, in_the_air=0, needless=0, max_splats=1)
         if not 0.0 <= self.prune_opacity <= 1.0:
             raise ValueError(f"mapper.density_control.prune_opacity={self.prune_opacity}: an opacity, from 0 to 1")
         if self.every < 1:

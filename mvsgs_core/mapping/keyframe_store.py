@@ -114,6 +114,18 @@ class KeyframeStore:
             view.velocity[:3] /= unit
             view.local_from_cam = local(view.world_from_cam)
 
+    def move(self, velocities: dict[int, np.ndarray], readout_time: float, reads_columns: bool) -> None:
+        """Velocities (6,) of the camera by keyframe, a twist a second, and the time in which photographs were read."""
+        for view in self.views:
+            found = velocities.get(view.index)
+            if view.as_taken and found is not None and np.isfinite(found).all():
+                view.velocity, view.readout_time, view.reads_columns = found, readout_time, reads_columns
+            elif readout_time == 0.0:
+                view.readout_time = 0.0
+        for between in self.between:
+            if between.twist.any():
+                between.readout_time, between.reads_columns = readout_time, reads_columns
+
     def _bound_images(self) -> bool:
         """Lets go the images of the frames, then of the keyframes, whose neighbors in time are closest. Keyframes'
         splats stay, and move with their poses."""

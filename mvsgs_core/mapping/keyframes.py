@@ -15,6 +15,9 @@ from mvsgs_core.geometry import Similarity
 from mvsgs_core.photometry import IDENTITY, compose, inverse
 from mvsgs_core.setting_ranges import at_least, within
 
+CELLS = 48  # of the grid on which a keyframe's surface is kept, in either direction
+HALF_MAX = float(np.finfo(np.float16).max)
+
 
 @dataclass(frozen=True)
 class RGBDKeyframe:
@@ -78,6 +81,7 @@ class TrainingView:
     image_on_disk: bool = False  # see resting_images.py
     as_taken: bool = True  # no shutter is taken out of the image: renders are as that saw it, as soon as it is known
     median_depth: float = 0.0  # of its depth map, in the mapper's unit; 0: it has none
+    surface: np.ndarray | None = None  # (3, CELLS, CELLS) of that, in that unit, see free_space.py; None: not known
     mean_color: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) of its image, 0 to 1; 0: not known
     valid: Tensor | None = None  # (H, W) bool; None: every pixel is
     visits: int = 0  # training iterations so far
@@ -143,10 +147,14 @@ class TrainingView:
     def drop_image(self) -> None:
         """Frees what only the training needs; pose, scale and exposure stay."""
         self.image, self.valid, self.image_on_disk = self.image.new_zeros((0, 0, 3)), None, False
+        self.surface = None
 
     def rescale(self, factor: float) -> None:
         """Lengths in a unit of 1 / `factor` of what it was; the moments follow, a gradient is divided by `factor`."""
         self.median_depth *= factor
+        if self.surface is not None:
+            depths = np.minimum(self.surface[:2].astype(np.float64) * factor, HALF_MAX)
+            self.surface = np.concatenate([depths, self.surface[2:]]).astype(np.float16)
         self.velocity[:3] *= factor
         self.pose_delta[:3, 3] *= factor
         self.pose_moments[0, :3] /= factor

@@ -19,6 +19,7 @@ from mvsgs_core.mapping.deformation import move_with_anchors
 from mvsgs_core.mapping.densifier import Densifier, checked_depth
 from mvsgs_core.mapping.exposure import ImageFormation, recolor_with_anchors
 from mvsgs_core.mapping.frame_of_reference import FrameOfReference
+from mvsgs_core.mapping.free_space import surface_of
 from mvsgs_core.mapping.keyframe_checks import NO_POSE, checked_keyframe, is_pose
 from mvsgs_core.mapping.keyframe_store import KeyframeStore
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView, median_of_known, training_view
@@ -238,11 +239,13 @@ class OnlineMapper:
         """Iteration `done` of `total` of the final refinement: any keyframe or frame between, rates falling from
         `first_rate`; half of them on those that are owed iterations, while any is.
 
-        prune: a sixth of the way, when the newest splats have settled, the map is rid of those that no keyframe needs;
-        what is left makes up for them, and each iteration costs less.
+        prune: at first the map is rid of splats in the air; a sixth of the way, when the newest splats have settled,
+        of those that no keyframe needs; what is left makes up for them, and each iteration costs less.
         """
         if not self.views or len(self.state) == 0:
             return
+        if prune and done == 0:
+            self.trainer.clear_the_air(self.keyframes.with_image)
         if prune and done == total // 6:
             self.trainer.prune(self.keyframes.with_image, self.median_depth)
         with self.log.time("refinement"):
@@ -291,15 +294,7 @@ class OnlineMapper:
         time of 0 holds for all keyframes, as poses are those of a camera without one then.
         """
         known = dict(zip(index.tolist(), geometry.twist_scaled(velocity, 1.0 / self.frame.length)))
-        for view in self.views:
-            found = known.get(view.index)
-            if view.as_taken and found is not None and np.isfinite(found).all():
-                view.velocity, view.readout_time, view.reads_columns = found, readout_time, reads_columns
-            elif readout_time == 0.0:
-                view.readout_time = 0.0
-        for between in self.keyframes.between:
-            if between.twist.any():
-                between.readout_time, between.reads_columns = readout_time, reads_columns
+        self.keyframes.move(known, readout_time, reads_columns)
 
     def expose(self) -> int:
         """Brings keyframes and colors to what `photometry` says now; returns the number of splats that changed.
@@ -389,7 +384,7 @@ class OnlineMapper:
             self.keyframes.place_anew(self.frame.local, self.frame.length)
         view = training_view(keyframe, self.frame.local(pose), self.config.max_pixels, self.state.device)
         view.world_from_cam, view.scale, view.median_depth = pose, scale, median / self.frame.length
-        view.fixed = not self.views
+        view.surface, view.fixed = surface_of(depth / np.float32(self.frame.length)), not self.views
         view.expose(self.photometry.exposures.get(view.index))
         if view.valid is not None:
             left_out = int((~view.valid).sum())

@@ -13,6 +13,7 @@ from mvsgs_core.mapping import density_control, losses, optimizer
 from mvsgs_core.mapping.camera_optimizer import step_pose
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.exposure import ImageFormation
+from mvsgs_core.mapping.free_space import in_the_air
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.losses import (
     LossInputs,
@@ -114,6 +115,16 @@ class Trainer:
                 change = density_control.control(self.state, self.config.density_control, median_depth, self.generator)
             for name, count in vars(change).items():
                 self.log.count(name, count)
+
+    def clear_the_air(self, views: list[TrainingView]) -> None:
+        """Removes the splats that lie before what most of these keyframes see, see `free_space`."""
+        config = self.config.density_control
+        if config.mode == "none" or not config.in_the_air:
+            return
+        with self.log.time("density_control"):
+            removed = in_the_air(self.state.splats.means.detach(), views, config.in_the_air)
+            self.log.count("in the air", int(removed.sum()))
+            self.state.keep(~removed)
 
     def prune(self, views: list[TrainingView], median_depth: float) -> None:
         """Removes the splats that the images of these keyframes do without, see `pruning`."""

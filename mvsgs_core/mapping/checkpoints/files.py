@@ -23,7 +23,7 @@ from mvsgs_core.array_file import read_arrays, write_arrays
 from mvsgs_core.kept_map import FOLDER
 
 KEYFRAMES = "keyframes"
-FORMAT, VERSION = "mvsgs checkpoint", 9
+FORMAT, VERSION = "mvsgs checkpoint", 10
 NEIGHBORS = 16  # keyframes before the newest one that stereo and fusion of the next ones may look at, at most
 
 

@@ -17,7 +17,7 @@ from mvsgs_core.mapping.checkpoints.waiting import waiting_arrays, waiting_of
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.exposure import ImageFormation
 from mvsgs_core.mapping.keyframe_store import awake
-from mvsgs_core.mapping.keyframes import TrainingView, exposure_of
+from mvsgs_core.mapping.keyframes import CELLS, TrainingView, exposure_of
 from mvsgs_core.mapping.map_state import PARAMETERS, MapState
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mapping.resting_images import bytes_of, rest, room_of
@@ -43,14 +43,14 @@ VIEWS: dict[str, tuple[type, tuple[int, ...]]] = {  # K keyframes: as in Trainin
     "median_depth": (np.float64, ()), "mean_color": (np.float64, (3,)), "visits": (np.int64, ()),
     "visits_here": (np.int64, ()),
     "loss_fast": (np.float64, ()), "loss_slow": (np.float64, ()), "loss_before": (np.float64, ()),
-    "intrinsics": (np.float64, (4,)),
+    "intrinsics": (np.float64, (4,)), "surface": (np.float16, (3, CELLS, CELLS)),
 }  # fmt: skip
-BETWEEN = VIEWS | {  # frames between keyframes, as in BetweenView
+BETWEEN = {name: kept for name, kept in VIEWS.items() if name != "surface"} | {  # frames between, as in BetweenView
     "keyframe": (np.int64, ()), "keyframe_from_cam": (np.float64, (4, 4)), "from_keyframe": (np.float32, (3, 4)),
     "twist": (np.float64, (6,)),
 }  # fmt: skip
 NEVER_BELOW_0 = ("pose_steps", "visits", "visits_here", "median_depth", "mean_color")
-MAY_BE_NAN = ("timestamp", "loss_fast", "loss_slow", "loss_before", "measured")
+MAY_BE_NAN = ("timestamp", "loss_fast", "loss_slow", "loss_before", "measured", "surface")
 
 
 def copy_of(
@@ -230,6 +230,7 @@ def _view(
     row["image"], row["valid"] = image(row.pop("file"))
     row["image_size"] = tuple(row["image_size"].tolist())
     row["measured"] = None if np.isnan(row["measured"]).any() else row["measured"]
+    row["surface"] = None if np.isnan(row.get("surface", np.nan)).any() else row["surface"]
     row["exposure"] = exposure_of(row["measured"], device)
     return kind(**row)
 
