@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from mvsgs_core.array_file import Arrays
+from mvsgs_core.mapping.checkpoints.state import copy_of, pack, unpack
 from mvsgs_core.mapping.free_space import in_the_air, surface_of
 from mvsgs_core.mapping.keyframes import CELLS, RGBDKeyframe, TrainingView, training_view
+from mvsgs_core.stats import Stats
 from tests.support.small_maps import CONFIG, mapped
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
@@ -99,3 +102,20 @@ def test_the_refinement_begins_without_them(margin: float) -> None:
     removed = mapper.log.counts.get("in the air", 0.0)
     assert len(mapper.state) == before - removed
     assert removed >= 15 if margin else removed == 0
+
+
+def test_a_checkpoint_keeps_what_keyframes_see() -> None:
+    mapper = mapped([rgbd_keyframe(k, pose_on_arc(k / 4)) for k in range(3)], CONFIG)
+    mapper.views[1].surface = None
+    meta, arrays = pack(copy_of(mapper, Stats(), {}, mapper.photometry.copy()), "map", ["image"] * 3, [])
+
+    def image(name: str) -> tuple[torch.Tensor, None]:
+        return torch.zeros((48, 64, 3), dtype=torch.uint8), None
+
+    again = unpack(meta, Arrays(arrays).of("map"), CONFIG, Stats(), {}, mapper.photometry.copy(), image)
+    assert again.views[1].surface is None
+    for k in (0, 2):
+        surface = mapper.views[k].surface
+        assert surface is not None
+        assert surface[2].all()
+        np.testing.assert_array_equal(again.views[k].surface, surface)
