@@ -21,8 +21,8 @@ static Observations observations(Array<double> poses, Array<double> points, Arra
         require(photograph.data()[n] >= 0 && photograph.data()[n] < photographs && point.data()[n] >= 0 &&
                     point.data()[n] < known && (n == 0 || point.data()[n - 1] <= point.data()[n]),
                 "sparse adjustment: observations must be of photographs and points that are there, sorted by point");
-    return {poses.data(), points.data(), lenses.data(), k1,    k2,
-            photograph.data(), point.data(), pixels.data(), count, min_z};
+    return {poses.data(), points.data(), lenses.data(), k1, k2, photograph.data(), point.data(), pixels.data(),
+            count, min_z};
 }
 
 // Residuals (N, 2) and depths (N).
