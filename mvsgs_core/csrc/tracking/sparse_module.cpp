@@ -1,4 +1,4 @@
-// Indices of photographs and points are checked here, shapes by the Python caller.
+// What observations refer to is checked here; what the sums are of, their maker knows.
 #include "sparse_module.hpp"
 
 #include <nanobind/stl/vector.h>
@@ -17,6 +17,11 @@ using namespace mvsgs;
 static Observations observations(Array<double> poses, Array<double> points, Array<double> lenses, double k1, double k2,
                                  Array<int64_t> photograph, Array<int64_t> point, Array<double> pixels, double min_z) {
     const int64_t count = photograph.shape(0), photographs = poses.shape(0), known = points.shape(0);
+    require(static_cast<int64_t>(point.size()) == count && static_cast<int64_t>(pixels.size()) == 2 * count &&
+                static_cast<int64_t>(poses.size()) == 16 * photographs &&
+                static_cast<int64_t>(points.size()) == 3 * known &&
+                static_cast<int64_t>(lenses.size()) == 4 * photographs,
+            "sparse adjustment: observations, poses, points and lenses do not belong together");
     for (int64_t n = 0; n < count; ++n)
         require(photograph.data()[n] >= 0 && photograph.data()[n] < photographs && point.data()[n] >= 0 &&
                     point.data()[n] < known && (n == 0 || point.data()[n - 1] <= point.data()[n]),

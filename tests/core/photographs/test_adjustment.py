@@ -158,6 +158,8 @@ def test_bad_input_is_refused() -> None:
         adjust_sparse(replace(start, point=start.point + 1), 1, 1.0)
     with pytest.raises(ValueError, match="photographs and points that are there"):
         adjust_sparse(replace(start, photograph=start.photograph - 1), 1, 1.0)
+    with pytest.raises(ValueError, match="do not belong together"):
+        adjust_sparse(replace(start, pixels=start.pixels[1:]), 1, 1.0)
     with pytest.raises(ValueError, match="sorted by point"):
         adjust_sparse(replace(start, point=start.point[::-1]), 1, 1.0)
     with pytest.raises(ValueError, match="points is not finite"):
