@@ -10,11 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from mvsgs_core.mapping.keyframes import RGBDKeyframe
+from mvsgs_core.mapping.keyframes import HALF_MAX, RGBDKeyframe
 from mvsgs_core.stats import Stats
 
 MAX_BYTES = 256_000_000  # of what is kept: of some 300 keyframes at the size of a depth map
-_LARGEST = float(np.finfo(np.float16).max)
 LATER = "keyframes that got the rest of their splats later"
 
 
@@ -115,7 +114,7 @@ def _known(depth: np.ndarray) -> np.ndarray:
 def _half(values: np.ndarray, unit: float = 1.0) -> np.ndarray:
     """(...) float16, 0 for what is beyond them; PyTorch's conversion takes a fifth of the time of NumPy's."""
     scaled = values * np.float32(1.0 / unit)
-    scaled[~(np.abs(scaled) <= _LARGEST)] = 0.0
+    scaled[~(np.abs(scaled) <= HALF_MAX)] = 0.0
     return np.asarray(torch.from_numpy(scaled).half().numpy())
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from mvsgs_core.mapping.map_state import PARAMETERS, MapState
 from mvsgs_core.rasterizer.reference import rotation_matrices
 from mvsgs_core.rasterizer.splats import Splats
-from mvsgs_core.setting_ranges import at_least
+from mvsgs_core.setting_ranges import at_least, within
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,8 @@ class DensityControlConfig:
     max_splats: int = 1_000_000  # no growth beyond
 
     def __post_init__(self) -> None:
-        at_least(self, gradient=0, split_scale=0, in_the_air=0, needless=0, max_splats=1)
+        at_least(self, gradient=0, split_scale=0, needless=0, max_splats=1)
+        within(self, in_the_air=(0, 1))
         if not 0.0 <= self.prune_opacity <= 1.0:
             raise ValueError(f"mapper.density_control.prune_opacity={self.prune_opacity}: an opacity, from 0 to 1")
         if self.every < 1:
