@@ -18,7 +18,8 @@ from PIL import Image, ImageFile, ImageOps
 
 from mvsgs_core.bad_file import BadFileError, brief, reading
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".avif", ".heic", ".heif")
+_NETPBM = (".ppm", ".pgm", ".pnm")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", *_NETPBM, ".avif", ".heic", ".heif")
 _HEIF = (".heic", ".heif")  # as phones take them
 MAX_PIXELS = 2**27  # of one image: 134 million, more than cameras of 100 million have
 _FORMATS = ("JPEG", "PNG", "BMP", "TIFF", "WEBP", "PPM", "AVIF")  # of these suffixes; Pillow knows 40 more

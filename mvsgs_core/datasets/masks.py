@@ -18,7 +18,7 @@ from mvsgs_core.datasets.framing import Framing, same_shape
 from mvsgs_core.datasets.lens import Lens
 
 FOLDERS = ("masks", "mask")
-_NO_ALPHA = (".jpg", ".jpeg", ".bmp", ".ppm")
+_NO_ALPHA = (".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".pnm")
 _LOSSY = (".jpg", ".jpeg", ".webp", ".avif", ".heic", ".heif")  # whose black is nearly black
 
 

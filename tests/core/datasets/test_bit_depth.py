@@ -24,8 +24,10 @@ def test_16_bit_gray_is_read_whatever_its_file(tmp_path: Path) -> None:
     gray = np.linspace(0, 65535, 48 * 64).reshape(48, 64).astype(np.uint16)
     for name in ("a.png", "b.tif"):
         Image.fromarray(gray).save(tmp_path / name)
-    (tmp_path / "c.ppm").write_bytes(b"P5 64 48 65535\n" + gray.astype(">u2").tobytes())
+    for name in ("c.ppm", "d.pgm", "e.pnm"):
+        (tmp_path / name).write_bytes(b"P5 64 48 65535\n" + gray.astype(">u2").tobytes())
     sequence = open_dataset("images", path=tmp_path, intrinsics=[50, 51, 31, 24])
+    assert len(sequence) == 5
     for item in sequence:
         assert (item.image == (gray >> 8)[..., None]).all()
     assert not sequence.warnings
