@@ -25,8 +25,13 @@ FOLDERS = (
 _MODELS = (
     ("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8), ("OPENCV_FISHEYE", 8),
     ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4), ("RADIAL_FISHEYE", 5), ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16), ("SIMPLE_DIVISION", 4), ("DIVISION", 5), ("SIMPLE_FISHEYE", 3), ("FISHEYE", 4),
+    ("EUCM", 6), ("EQUIRECTANGULAR", 2),
 )  # fmt: skip
 _PARAMETERS = dict(_MODELS)
+_UNLIKE_OPENCV = (
+    "FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "DIVISION", "EUCM", "EQUIRECTANGULAR",
+)  # fmt: skip
 
 
 def find_colmap(folder: Path) -> Path | None:
@@ -61,10 +66,10 @@ def read_colmap(folder: Path) -> Model:
 
 
 def lens_of(model: str, width: int, height: int, p: Sequence[float]) -> Lens:
-    """The lens of a COLMAP camera. Raises ValueError for FOV and THIN_PRISM_FISHEYE: undistort those with COLMAP."""
+    """The lens of a COLMAP camera. Raises ValueError for one that is unlike OpenCV's: undistort its images."""
     if model not in _PARAMETERS or len(p) != _PARAMETERS[model]:
         raise ValueError(f"COLMAP camera model {model} with {len(p)} parameters is unknown")
-    if model in ("FOV", "THIN_PRISM_FISHEYE"):
+    if model in _UNLIKE_OPENCV:
         raise ValueError(
             f"COLMAP camera model {model} is not supported: run `colmap image_undistorter` and use its output"
         )

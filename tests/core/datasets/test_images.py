@@ -100,6 +100,8 @@ def test_damaged_colmap_models(tmp_path: Path) -> None:
         ("OPENCV_FISHEYE", (50, 51, 32, 24, 1, 2, 3, 4), (50, 51), (1, 2, 3, 4), True),
         ("SIMPLE_RADIAL_FISHEYE", (50, 32, 24, 0.1), (50, 50), (0.1, 0, 0, 0), True),
         ("RADIAL_FISHEYE", (50, 32, 24, 0.1, 0.2), (50, 50), (0.1, 0.2, 0, 0), True),
+        ("SIMPLE_FISHEYE", (50, 32, 24), (50, 50), (0, 0, 0, 0), True),
+        ("FISHEYE", (50, 51, 32, 24), (50, 51), (0, 0, 0, 0), True),
     ],
 )
 def test_colmap_camera_models(
@@ -111,8 +113,9 @@ def test_colmap_camera_models(
 
 
 def test_colmap_models_without_counterpart() -> None:
-    with pytest.raises(ValueError, match="image_undistorter"):
-        lens_of("FOV", 64, 48, (50, 51, 32, 24, 0.5))
+    for model, parameters in (("FOV", (50, 51, 32, 24, 0.5)), ("DIVISION", (50, 51, 32, 24, 0.1)), ("EUCM", (9,) * 6)):
+        with pytest.raises(ValueError, match=f"{model} is not supported: run `colmap image_undistorter`"):
+            lens_of(model, 64, 48, parameters)
     with pytest.raises(ValueError, match="unknown"):
         lens_of("PINHOLE", 64, 48, (50, 51, 32))
 
