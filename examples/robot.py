@@ -68,7 +68,9 @@ def frames(sequence: Sequence, fast: bool) -> Iterator[Frame]:
         if not fast:
             time.sleep(max(0.0, began + item.timestamp - now))
         guessed, exposure = item.intrinsics_guessed, item.exposure
-        yield Frame(item.index, item.timestamp, item.image, item.intrinsics, guessed, exposure)
+        yield Frame(
+            item.index, item.timestamp, item.image, item.intrinsics, guessed, exposure, place=item.place, mask=item.mask
+        )
     for warning in sequence.warnings:
         say(f"warning: {warning}")
 

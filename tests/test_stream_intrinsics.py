@@ -102,11 +102,17 @@ def test_intrinsics_of_images_of_another_size_are_doubted_once() -> None:
     assert "another size (about 64x48)" in doubt
 
 
-def test_the_robot_in_examples_sends_the_intrinsics_of_the_command_line_or_refuses_them(tmp_path: Path) -> None:
+def test_the_robot_in_examples_sends_masks_and_the_intrinsics_of_the_command_line(tmp_path: Path) -> None:
     for k in range(3):
         cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((48, 64, 3), 8 * k, dtype=np.uint8))
     program, given = runpy.run_path(str(ROOT / "examples/robot.py")), ("50", "50", "31.5", "23.5")
     sent = list(program["opened"](program["parse"](["--dataset", "images", str(tmp_path), "--intrinsics", *given])))
     assert [frame.intrinsics.tolist() for frame in sent] == 3 * [[float(v) for v in given]]
+    (tmp_path / "masks").mkdir()
+    cv2.imwrite(str(tmp_path / "masks/1.png"), np.repeat(np.uint8([9, 0]), [40, 8])[:, None].repeat(64, 1))
+    masks = [frame.mask for frame in program["opened"](program["parse"](["--dataset", "images", str(tmp_path)]))]
+    assert [mask is None for mask in masks] == [True, False, True]
+    assert masks[1][:40].all()
+    assert not masks[1][40:].any()
     with pytest.raises(ValueError, match="no option"):
         program["opened"](program["parse"](["--dataset", "synthetic", "room", "--intrinsics", *given]))
