@@ -180,6 +180,15 @@ def test_a_runner_refuses_what_a_node_did_not_declare() -> None:
         list(Runner("wrong", Wrong()).handle(frame()))
 
 
+def test_a_runner_says_how_a_message_is_returned() -> None:
+    class Returning(Node):
+        def on_frame(self, frame: Frame) -> Iterator[Frame]:
+            return frame  # type: ignore[return-value]
+
+    with pytest.raises(TypeError, match="Returning returns a Frame: a node yields its messages, or returns a list of"):
+        list(Runner("returning", Returning()).handle(frame()))
+
+
 def test_a_runner_refuses_frames_that_are_not_numbered_upward() -> None:
     class Numbered(Node):
         indices = (0, 3)

@@ -85,6 +85,11 @@ class Runner:
             return hook(*given)
 
     def _checked(self, produced: Iterable[Message] | None) -> Iterator[Message]:
+        if not isinstance(produced or (), Iterable):
+            raise TypeError(
+                f"{type(self.node).__name__} returns a {type(produced).__name__}: a node yields its messages, "
+                "or returns a list of them"
+            )
         messages = iter(produced or ())
         while True:
             start = time.perf_counter()
