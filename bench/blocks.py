@@ -27,6 +27,7 @@ from mvsgs_core.held_out import is_held_out
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.blocks import job
 from mvsgs_core.mapping.blocks.config import RefineConfig
+from mvsgs_core.mapping.blocks.refinement import together
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.named_modules import is_installed
 from mvsgs_core.rasterizer.spherical_harmonics import C0
@@ -90,16 +91,19 @@ def refined(
 
 def longest(begun: Atlas, blocks: int, total: int) -> float:
     """Seconds of the processor that refinement in blocks takes where each has a core: what is done before and after,
-    and the block that takes longest."""
+    over the whole map too, and the block that takes longest."""
     mapper = begun.frozen().current
     start = time.process_time()
     parting = job.parting_of(mapper, blocks)
-    jobs = [job.job_of(mapper, parting, b, n) for b, n in enumerate(job.iterations_of(mapper, parting, total))]
+    parts = job.iterations_of(mapper, parting, total)
+    jobs = [job.job_of(mapper, parting, b, n, together(n)) for b, n in enumerate(parts)]
     ends, results = [time.process_time()], []
     for each in jobs:
         results += [result for result in job.refined(each, job.plain(mapper.config)) if result is not None]
         ends.append(time.process_time())
     job.merge(mapper, results)
+    for done in range(total - together(total), total):
+        mapper.refine(done, total)
     return time.process_time() - ends[-1] + ends[0] - start + float(np.diff(ends).max())
 
 

@@ -72,17 +72,18 @@ def parting_of(mapper: OnlineMapper, blocks: int) -> Parting:
     opacity = torch.sigmoid(splats.opacity_logits).cpu().numpy()
     overlap = mapper.config.refine.overlap
     views = mapper.views
-    images = {view.index: [view] if view.has_image else [] for view in views}
+    between: dict[int, list[TrainingView]] = {}
     for frame in mapper.keyframes.between:
-        images.setdefault(frame.keyframe, []).append(mapper.chosen(frame))
+        between.setdefault(frame.keyframe, []).append(mapper.chosen(frame))
 
     def shown(k: int) -> np.ndarray:
         found = np.zeros(len(mapper.state), bool)
-        for view in images[views[k].index]:
+        for view in [views[k]] if views[k].has_image else between.get(views[k].index, []):
             found |= (mapper.trainer.weights(view, mapper.median_depth) >= GRAY_LEVEL).cpu().numpy()
         return found
 
-    return part(views, means, log_scales, opacity, mapper.median_depth, blocks, overlap, shown)
+    shared = np.array([view.index in between for view in views], bool)
+    return part(views, means, log_scales, opacity, mapper.median_depth, blocks, overlap, shown, shared)
 
 
 def iterations_of(mapper: OnlineMapper, parting: Parting, total: int) -> list[int]:
@@ -94,8 +95,8 @@ def iterations_of(mapper: OnlineMapper, parting: Parting, total: int) -> list[in
     return parts
 
 
-def job_of(mapper: OnlineMapper, parting: Parting, block: int, iterations: int) -> Job:
-    """The block's part of the mapper, which goes on as it is."""
+def job_of(mapper: OnlineMapper, parting: Parting, block: int, iterations: int, last: int = 0) -> Job:
+    """The block's part of the mapper, which goes on as it is. last: of the iterations, those that are not its own."""
     trained = {view.index for view, here in zip(mapper.views, parting.trained[block]) if here}
     home = [view.index for view, at in zip(mapper.views, parting.home) if at == block]
     for frame in mapper.keyframes.between:
@@ -107,7 +108,7 @@ def job_of(mapper: OnlineMapper, parting: Parting, block: int, iterations: int) 
     meta, arrays = pack(copied, "map", *names)
     arrays |= {f"photometry/{name}": value for name, value in photometry_arrays(copied.photometry).items()}
     arrays["owned"] = (parting.owner == block)[parting.needed[block]]
-    return Job({"mapper": meta, "refinement": iterations, "home": home}, arrays, images)
+    return Job({"mapper": meta, "refinement": iterations, "last": last, "home": home}, arrays, images)
 
 
 def refined(job: Job, config: MapperConfig) -> Iterator[Result | None]:
@@ -129,7 +130,7 @@ def refined(job: Job, config: MapperConfig) -> Iterator[Result | None]:
     for view in mapper.views:
         view.fixed = view.fixed or view.index not in home  # a pose is refined at home
     total, before = job.meta["refinement"], mapper.iterations
-    for done in range(total):
+    for done in range(total - job.meta["last"]):
         mapper.refine(done, total)
         yield None
     state.keep(state.anchors != NOBODY)

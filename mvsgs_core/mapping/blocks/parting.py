@@ -1,11 +1,12 @@
 """A map parted into blocks: which one owns a splat, and which keyframes and splats each needs.
 
-Keyframes are parted by where the middle of what they see is: halves of equal number, along the axis on which these
-points are spread most, and so on (Bentley's k-d tree, 1975). The planes between them part the splats, too, each of
-which is owned by one block. A keyframe is at home in one and a guest in every other of which it sees enough.
+Keyframes are parted by where the middle of what they see is: in halves of equal work by a plane across an axis, these
+again, and so on (Bentley's k-d tree, 1975). The planes part the splats, too, each of which is owned by one block. A
+keyframe is at home in one and a guest in every other of which it sees enough. A block's work is its keyframes, guests
+too, times its splats: an iteration goes over all of these.
 
-Whether it sees enough is asked of clumps, the splats of one block in a cube, of which nothing hides another. Which
-splats a block needs is asked of the keyframes' renders: a street's far end is mostly hidden.
+Whether it sees enough is asked of clumps, the splats in a cube, of which nothing hides another. Which splats a block
+needs is asked of the keyframes' renders: a street's far end is mostly hidden.
 """
 
 from __future__ import annotations
@@ -38,39 +39,56 @@ class Parting:
 class _Clumps:
     centers: np.ndarray  # (C, 3)
     area: np.ndarray  # (C,) of its splats, as far as they are opaque
-    owner: np.ndarray  # (C,) int64 block
+
+
+@dataclass(frozen=True)
+class _Sight:
+    """What a keyframe sees of the map nearby."""
+
+    clumps: np.ndarray  # (S,) int64 their numbers
+    fraction: np.ndarray  # (S,) of all that it sees there
 
 
 def part(
     views: Sequence[TrainingView], means: np.ndarray, log_scales: np.ndarray, opacity: np.ndarray, median_depth: float,
-    blocks: int, overlap: float, shown: Callable[[int], np.ndarray],
+    blocks: int, overlap: float, shown: Callable[[int], np.ndarray], shared: np.ndarray,
 ) -> Parting:  # fmt: skip
     """Of keyframes (K) and splats: means (N, 3), log_scales (N, 3), opacity (N,) 0 to 1, in the mapper's frame.
 
     shown: (N,) bool, splats that a keyframe's image shows, by its place among the views; each is asked once.
-    median_depth: of the scene; overlap: fraction of what a keyframe sees from which on it is a guest. A block that no
-    keyframe is at home in is left out: its splats go to the first one.
+    shared: (K,) bool, keyframes beside which other frames are trained on: what those see, the keyframes before and
+    after show as well. median_depth: of the scene; overlap: fraction of what a keyframe sees from which on it is a
+    guest. A block that no keyframe is at home in is left out: its splats go to the first one.
     """
     points = np.array([_middle(view, median_depth) for view in views]).reshape(-1, 3)
-    planes = _planes(points, min(blocks, max(1, len(views))))
-    home, owner = _sides(points, planes), _sides(means.astype(np.float64), planes)
+    if min(blocks, len(views)) < 2:
+        return _whole(len(views), len(means))
+    clumps = _clumps(means, log_scales, opacity, CLUMP * median_depth)
+    sights = [_sight(view, clumps, median_depth) for view in views]
+    reach = np.array([_reach(point, sight, clumps, overlap) for point, sight in zip(points, sights)])
+    planes = _planes(points, reach, means.astype(np.float64), min(blocks, len(views)))
+    home, owner, held = (_sides(at, planes) for at in (points, means.astype(np.float64), clumps.centers))
     kept = np.unique(home)
+    if len(kept) == 1:
+        return _whole(len(views), len(means))
     home = np.searchsorted(kept, home)
-    owner = np.where(np.isin(owner, kept), np.searchsorted(kept, owner), 0)
-    count = max(1, len(kept))
-    trained = home == np.arange(count)[:, None]
-    if count == 1:
-        return Parting(home, owner, trained, (np.ones(len(means), bool),))
-    clumps = _clumps(means, log_scales, opacity, owner, CLUMP * median_depth)
-    needed = owner == np.arange(count)[:, None]
-    for k, view in enumerate(views):
-        depth, inside = _seen(view, clumps.centers)
-        near = inside & (depth < FAR * (view.median_depth or median_depth))
-        weight = np.where(near, clumps.area / np.maximum(depth, 1e-3 * median_depth) ** 2, 0.0)
-        fraction = np.bincount(clumps.owner, weight, count) / max(float(weight.sum()), 1e-30)
-        trained[:, k] |= fraction > overlap
-        needed[trained[:, k]] |= shown(k)
+    owner, held = (np.where(np.isin(at, kept), np.searchsorted(kept, at), 0) for at in (owner, held))
+    trained = home == np.arange(len(kept))[:, None]
+    for k, sight in enumerate(sights):
+        trained[:, k] |= np.bincount(held[sight.clumps], sight.fraction, len(kept)) > overlap
+    beside = trained & shared
+    wanted = trained.copy()
+    wanted[:, 1:] |= beside[:, :-1]
+    wanted[:, :-1] |= beside[:, 1:]
+    needed = owner == np.arange(len(kept))[:, None]
+    for k in range(len(views)):
+        needed[wanted[:, k]] |= shown(k)
     return Parting(home, owner, trained, tuple(needed))
+
+
+def _whole(views: int, splats: int) -> Parting:
+    home, owner = np.zeros(views, np.int64), np.zeros(splats, np.int64)
+    return Parting(home, owner, np.ones((1, views), bool), (np.ones(splats, bool),))
 
 
 def _middle(view: TrainingView, median_depth: float) -> np.ndarray:
@@ -82,17 +100,33 @@ def _middle(view: TrainingView, median_depth: float) -> np.ndarray:
 Planes = tuple[int, float, "Planes | None", "Planes | None"]  # axis, value; what parts the side below, and that above
 
 
-def _planes(points: np.ndarray, blocks: int) -> Planes | None:
-    """None: one block. Equal points are never parted."""
+def _planes(points: np.ndarray, reach: np.ndarray, means: np.ndarray, blocks: int) -> Planes | None:
+    """None: one block. Equal points are never parted. reach: (K, 2, 3), see `_reach`."""
     if blocks < 2 or len(points) < 2:
         return None
-    axis = int(np.argmax(np.ptp(points, axis=0)))
-    below = blocks // 2
-    sorted_ = np.sort(points[:, axis])
-    cut = min(max(1, round(len(points) * below / blocks)), len(points) - 1)
-    value = float(sorted_[cut - 1] + sorted_[cut]) / 2
-    under = points[:, axis] < value
-    return axis, value, _planes(points[under], below), _planes(points[~under], blocks - below)
+    below, least, found = blocks // 2, np.inf, None
+    for axis in np.argsort(-np.ptp(points, axis=0), kind="stable").tolist():
+        values = np.unique(points[:, axis])
+        cuts = (values[1:] + values[:-1]) / 2
+        if not len(cuts):
+            continue
+        splats = np.searchsorted(np.sort(means[:, axis]), cuts)
+        under = np.searchsorted(np.sort(reach[:, 0, axis]), cuts)
+        over = len(points) - np.searchsorted(np.sort(reach[:, 1, axis]), cuts)
+        # of one of the blocks that each side is to become
+        work = np.maximum(under * splats / below**2, over * (len(means) - splats) / (blocks - below) ** 2)
+        best = int(np.argmin(work))
+        if work[best] < least:
+            least, found = work[best], (axis, float(cuts[best]))
+    if found is None:
+        return None
+    axis, value = found
+    under, there = points[:, axis] < value, means[:, axis] < value
+    return (
+        axis, value,
+        _planes(points[under], reach[under], means[there], below),
+        _planes(points[~under], reach[~under], means[~there], blocks - below),
+    )  # fmt: skip
 
 
 def _sides(points: np.ndarray, planes: Planes | None) -> np.ndarray:
@@ -111,20 +145,38 @@ def _leaves(planes: Planes | None) -> int:
     return 1 if planes is None else _leaves(planes[2]) + _leaves(planes[3])
 
 
-def _clumps(
-    means: np.ndarray, log_scales: np.ndarray, opacity: np.ndarray, owner: np.ndarray, side: float
-) -> _Clumps:  # fmt: skip
-    cubes = np.column_stack([owner, np.floor(means / side).astype(np.int64)])
-    _, of_splat = np.unique(cubes, axis=0, return_inverse=True)
+def _clumps(means: np.ndarray, log_scales: np.ndarray, opacity: np.ndarray, side: float) -> _Clumps:
+    _, of_splat = np.unique(np.floor(means / side).astype(np.int64), axis=0, return_inverse=True)
     of_splat = of_splat.reshape(-1)
     count = int(of_splat.max(initial=-1)) + 1
     number = np.bincount(of_splat, minlength=count)
     centers = np.column_stack([np.bincount(of_splat, means[:, i], count) for i in range(3)]) / number[:, None]
     scales = np.sort(np.exp(log_scales.astype(np.float64)), axis=1)
-    owners = np.zeros(count, dtype=np.int64)
-    owners[of_splat] = owner
-    area = np.bincount(of_splat, opacity * scales[:, 1] * scales[:, 2], count)
-    return _Clumps(centers, area, owners)
+    return _Clumps(centers, np.bincount(of_splat, opacity * scales[:, 1] * scales[:, 2], count))
+
+
+def _sight(view: TrainingView, clumps: _Clumps, median_depth: float) -> _Sight:
+    depth, inside = _seen(view, clumps.centers)
+    near = np.flatnonzero(inside & (depth < FAR * (view.median_depth or median_depth)))
+    weight = clumps.area[near] / np.maximum(depth[near], 1e-3 * median_depth) ** 2
+    return _Sight(near, weight / max(float(weight.sum()), 1e-30))
+
+
+def _reach(point: np.ndarray, sight: _Sight, clumps: _Clumps, overlap: float) -> np.ndarray:
+    """(2, 3): a keyframe is trained on below a plane that lies above the first, and above one below the second.
+
+    point: (3,) the middle of what it sees.
+    """
+    ends = np.stack([point, point])
+    for axis in range(3):
+        at = clumps.centers[sight.clumps, axis]
+        order = np.argsort(at)
+        sum_ = np.cumsum(sight.fraction[order])
+        for end, enough in ((0, sum_ > overlap), (1, 1.0 - sum_ + sight.fraction[order] > overlap)):
+            if enough.any():
+                chosen = at[order][enough]
+                ends[end, axis] = min(point[axis], chosen[0]) if end == 0 else max(point[axis], chosen[-1])
+    return ends
 
 
 def _seen(view: TrainingView, centers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,7 @@
-"""The final refinement of a large map in blocks: here, one after the other, or on a cluster, one a worker."""
+"""The final refinement of a large map in blocks: here, one after the other, or on a cluster, one a worker.
+
+The last iterations go over the whole map: what a block makes of its edge is made for what another one had there before.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from mvsgs_core.mapping.blocks.ray_cluster import ClusterError, RayCluster
 from mvsgs_core.mapping.mapper import OnlineMapper
 
 WORTH = 1.5  # times the iterations of the whole map that blocks of it may take in one process
+TOGETHER = 0.05  # of the iterations, those over the whole map
 
 
 def refined_in_blocks(mapper: OnlineMapper, total: int) -> Iterator[None] | None:
@@ -42,12 +46,20 @@ def _here(
     for block, iterations in enumerate(iterations_of(mapper, parting, total)):
         if block in results:
             continue
-        for result in refined(job_of(mapper, parting, block, iterations), mapper.config):
+        for result in refined(job_of(mapper, parting, block, iterations, together(iterations)), mapper.config):
             if result is not None:
                 results[block] = result
             yield
     merge(mapper, [results[block] for block in sorted(results)])
     mapper.log.values["blocks"] = len(parting)
+    for done in range(total - together(total), total):
+        mapper.refine(done, total)
+        yield
+
+
+def together(iterations: int) -> int:
+    """Of a refinement's iterations, the last ones: of the whole map, no block's own."""
+    return round(TOGETHER * iterations)
 
 
 def _on_cluster(mapper: OnlineMapper, total: int) -> Iterator[None]:
@@ -58,7 +70,7 @@ def _on_cluster(mapper: OnlineMapper, total: int) -> Iterator[None]:
         with mapper.log.time("refinement on Ray"), RayCluster(mapper.config.refine) as cluster:
             parting = parting_of(mapper, _blocks(mapper, cluster.machines))
             parts = iterations_of(mapper, parting, total)
-            jobs = (job_of(mapper, parting, block, iterations) for block, iterations in enumerate(parts))
+            jobs = (job_of(mapper, parting, block, each, together(each)) for block, each in enumerate(parts))
             for finished in cluster.refined(jobs, plain(mapper.config)):
                 results.update(finished)
                 yield
@@ -68,4 +80,4 @@ def _on_cluster(mapper: OnlineMapper, total: int) -> Iterator[None]:
     yield from _here(mapper, total, parting or parting_of(mapper, _blocks(mapper)), results)
 
 
-__all__ = ["refined_in_blocks"]
+__all__ = ["refined_in_blocks", "together"]

@@ -11,7 +11,8 @@ import torch
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.blocks.config import RefineConfig
 from mvsgs_core.mapping.blocks.job import NOBODY, iterations_of, job_of, merge, parting_of, refined
-from mvsgs_core.mapping.blocks.refinement import refined_in_blocks
+from mvsgs_core.mapping.blocks.parting import Parting, part
+from mvsgs_core.mapping.blocks.refinement import refined_in_blocks, together
 from mvsgs_core.mapping.mapper import OnlineMapper
 from tests.support.small_atlas import PLAIN, begun
 from tests.support.small_maps import CONFIG, mapped, score
@@ -61,7 +62,8 @@ def test_every_splat_is_owned_and_trained_once(blocks: int) -> None:
     mapper = corridor(blocks)
     splats, parting = len(mapper.state), parting_of(mapper, blocks)
     assert len(parting) == blocks
-    assert np.ptp(np.bincount(parting.home)) <= 1
+    work = parting.trained.sum(axis=1) * np.bincount(parting.owner)
+    assert work.max() < 1.4 * work.min()
     for b in range(blocks):
         assert parting.needed[b][parting.owner == b].all()
         assert parting.trained[b][parting.home == b].all()
@@ -73,6 +75,52 @@ def test_every_splat_is_owned_and_trained_once(blocks: int) -> None:
     merge(mapper, [result for result in results if result is not None])
     assert len(mapper.state) == splats
     assert np.array_equal(np.sort(mapper.state.anchors.numpy()), before)
+
+
+def test_the_denser_part_of_a_map_gets_fewer_keyframes() -> None:
+    mapper = corridor(overlap=1.0)
+    means, log_scales = mapper.state.splats.means.detach().numpy(), mapper.state.splats.log_scales.detach().numpy()
+    dense = parting_of(mapper, 2).owner == 0
+
+    def parted(times: int) -> Parting:
+        rows = np.concatenate([np.arange(len(means)), np.repeat(np.flatnonzero(dense), times - 1)])
+        opacity, nothing = np.ones(len(rows)), np.zeros(len(rows), bool)
+        alone = np.zeros(len(mapper.views), bool)
+        return part(
+            mapper.views, means[rows], log_scales[rows], opacity, mapper.median_depth, 2, 1.0, lambda k: nothing, alone
+        )
+
+    for times in (1, 3):
+        parting = parted(times)
+        keyframes, splats = np.bincount(parting.home), np.bincount(parting.owner)
+        assert (keyframes * splats).max() < 1.6 * (keyframes * splats).min()
+    assert parted(3).home.sum() > parted(1).home.sum()
+
+
+def test_where_frames_between_are_trained_on_a_block_is_given_what_the_keyframes_around_show() -> None:
+    mapper = corridor(overlap=1.0)
+    means, log_scales = mapper.state.splats.means.detach().numpy(), mapper.state.splats.log_scales.detach().numpy()
+    opacity, owner = np.ones(len(means)), parting_of(mapper, 2).owner
+    told = np.stack([np.flatnonzero(owner == b)[: len(mapper.views)] for b in range(2)])  # a splat each a keyframe
+
+    def given(shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(2, K) bool: whether a block has the other's splats of a keyframe; and whether it trains on that."""
+
+        def shown(k: int) -> np.ndarray:
+            return np.isin(np.arange(len(means)), told[:, k])
+
+        parting = part(mapper.views, means, log_scales, opacity, mapper.median_depth, 2, 1.0, shown, shared)
+        return np.stack([parting.needed[b][told[1 - b]] for b in range(2)]), parting.trained
+
+    alone = np.zeros(len(mapper.views), bool)
+    found, trained = given(alone)
+    assert np.array_equal(found, trained)
+    last = int(np.flatnonzero(np.diff(trained[0].astype(int)))[0])
+    found, trained = given(np.arange(len(alone)) == last)
+    home = int(trained[1, last])
+    assert found[home, last + 1]
+    assert not trained[home, last + 1]
+    assert found.sum() == trained.sum() + 1
 
 
 def test_what_pruning_takes_is_gone_and_nothing_of_another_block_comes() -> None:
@@ -89,7 +137,9 @@ def test_an_image_has_as_many_iterations_in_each_block_and_the_map_ends_as_well(
         whole.refine(done, 40)
     before, parting = parted.iterations, parting_of(parted, 2)
     refine(parted, 40)
-    assert parted.iterations - before == 5 * parting.trained.sum()  # 40 for 8 images
+    # 40 for 8 images, the last 2 over the whole map
+    assert parted.iterations - before == sum(n - together(n) for n in iterations_of(whole, parting, 40)) + together(40)
+    assert together(40) == 2
     held_out = [rgbd_keyframe(0, pose_on_arc(t), SIZE) for t in (0.21, 0.5, 0.77)]
     psnr = [np.mean([score(mapper, view) for view in held_out]) for mapper in (whole, parted)]
     assert psnr[1] > psnr[0] - 0.2
@@ -126,7 +176,7 @@ def test_keyframes_that_see_enough_of_a_block_are_guests_and_no_others() -> None
     alone, all_ = parting_of(corridor(overlap=1.0), 2), parting_of(corridor(overlap=0.0), 2)
     assert alone.trained.sum() == 8
     assert 8 < all_.trained.sum() <= 16
-    assert iterations_of(corridor(), alone, 80) == [40, 40]
+    assert iterations_of(corridor(), alone, 80) == (10 * np.bincount(alone.home)).tolist()
 
 
 def test_a_pose_is_refined_at_home_and_not_where_its_keyframe_is_a_guest() -> None:
