@@ -13,7 +13,7 @@ from mvsgs_core.mapping.blocks.ray_cluster import ClusterError, RayCluster
 from mvsgs_core.mapping.mapper import OnlineMapper
 
 WORTH = 1.5  # times the iterations of the whole map that blocks of it may take in one process
-TOGETHER = 0.2  # of the iterations, those over the whole map
+TOGETHER = 0.05  # of the iterations, those over the whole map
 
 
 def refined_in_blocks(mapper: OnlineMapper, total: int) -> Iterator[None] | None:
@@ -51,10 +51,10 @@ def _here(
                 results[block] = result
             yield
     merge(mapper, [results[block] for block in sorted(results)])
-    mapper.log.values["blocks"] = len(parting)
     for done in range(total - together(total), total):
         mapper.refine(done, total)
         yield
+    mapper.log.values["blocks"] = len(parting)
 
 
 def together(iterations: int) -> int:
