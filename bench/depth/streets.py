@@ -5,8 +5,7 @@ by less than a tenth. Half of all the tracker's points, by chance, are kept from
 
 - kept: part of the pixels that the filters leave; of a street those below the horizon, which lies at the image's
   principal point, as the camera is level.
-- outliers: kept depths at verified points that stereo did not have, 5 % or more off; of all, and of the pixels that the
-  confidence puts first, as many as should be kept.
+- outliers: kept depths at verified points that stereo did not have, 5 % or more off.
 """
 
 from __future__ import annotations
@@ -70,10 +69,6 @@ def street_rows(area: int) -> list[Row]:
     return rows
 
 
-def _mean(chosen: np.ndarray) -> float:
-    return float(np.mean(chosen)) if len(chosen) else float("nan")
-
-
 def load_street(street: Street, area: int) -> tuple[list[StereoKeyframe], list[Points | None]]:
     """Keyframes as the tracker has them at the end, and their verified points; None where it dropped the keyframe."""
     tracker, sent = Tracker(), Collected()
@@ -106,11 +101,11 @@ def _without(view: StereoKeyframe, held: np.ndarray) -> StereoKeyframe:
 def _scores(
     name: str, street: Street, found: Run, points: list[Points | None], withheld: list[np.ndarray]
 ) -> list[Row]:
-    kept, ratios, sure, total = [], [], [], 0
+    kept, ratios, total = [], [], 0
     for fused, known, held in zip(found.fused, points, withheld, strict=True):
         height, width = fused.depth.shape
         first = int(np.ceil(fused.view.intrinsics[3])) if street.below_horizon else 0
-        kept.append(np.where(fused.depth > 0, fused.confidence, 0.0)[first:])
+        kept.append(fused.depth[first:] > 0)
         if known is None:
             continue
         mine = held[known.cell]
@@ -118,17 +113,14 @@ def _scores(
         ratio = fused.depth[v, u] * known.inverse_depth[mine]
         total += len(ratio)
         ratios.append(ratio[ratio > 0])
-        sure.append(fused.confidence[v, u][ratio > 0])
-    ratio, confidence = np.concatenate(ratios), np.concatenate(kept)
-    wrong = np.abs(ratio - 1.0) >= WITHIN
-    surest = np.concatenate(sure) >= np.quantile(confidence, 1.0 - street.kept)
+    ratio = np.concatenate(ratios)
     pixels = sum(f.counts["pixels"] for f in found.fused)
     why = [sum(f.counts.get(f"rejected: {reason}", 0.0) for f in found.fused) / pixels for reason in REASONS]
     part = "kept below the horizon" if street.below_horizon else "kept"
+    outliers = float(np.mean(np.abs(ratio - 1.0) >= WITHIN)) if len(ratio) else float("nan")
     return [
-        at_least(f"{name}, small parallax: {part}", float((confidence > 0).mean()), "", street.kept),
-        at_most(f"{name}, small parallax: outliers at verified points", _mean(wrong), "", 0.1),
-        Row(f"{name}, small parallax: outliers of the surest {street.kept:.0%}", _mean(wrong[surest])),
+        at_least(f"{name}, small parallax: {part}", float(np.concatenate(kept).mean()), "", street.kept),
+        at_most(f"{name}, small parallax: outliers at verified points", outliers, "", 0.1),
         Row(f"{name}, small parallax: verified points kept", len(ratio) / max(total, 1)),
         Row(f"{name}, small parallax: rejected by {', '.join(REASONS)}", ", ".join(f"{part:.2f}" for part in why)),
     ]
