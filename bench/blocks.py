@@ -96,13 +96,13 @@ def longest(begun: Atlas, blocks: int, total: int) -> float:
     start = time.process_time()
     parting = job.parting_of(mapper, blocks)
     parts = job.iterations_of(mapper, parting, total)
-    jobs = [job.job_of(mapper, parting, b, n, together(n)) for b, n in enumerate(parts)]
+    jobs = [job.job_of(mapper, parting, b, n, together(n, len(parts))) for b, n in enumerate(parts)]
     ends, results = [time.process_time()], []
     for each in jobs:
         results += [result for result in job.refined(each, job.plain(mapper.config)) if result is not None]
         ends.append(time.process_time())
     job.merge(mapper, results)
-    for done in range(total - together(total), total):
+    for done in range(total - together(total, len(parts)), total):
         mapper.refine(done, total)
     return time.process_time() - ends[-1] + ends[0] - start + float(np.diff(ends).max())
 
@@ -163,7 +163,7 @@ def compared(name: str, begun: Atlas, photographs: list[Photograph], total: int,
 
 
 def timed_rows(name: str, begun: Atlas, total: int, rounds: int) -> list[Row]:
-    alone, together = [], []
+    alone, parted = [], []
     known = set(begun.current.log.warnings)
     with ray_nodes(2) as address:
         for _ in range(rounds):
@@ -171,11 +171,11 @@ def timed_rows(name: str, begun: Atlas, total: int, rounds: int) -> list[Row]:
             mapper, seconds = refined(begun, RefineConfig(by="ray", address=address), total)
             if new := [warning for warning in mapper.log.warnings if warning not in known]:
                 raise RuntimeError(new[0])  # that it was refined here, as the cluster failed
-            together.append(seconds)
-    faster = [one / two for one, two in zip(alone, together)]
+            parted.append(seconds)
+    faster = [one / two for one, two in zip(alone, parted)]
     return [
         timed(f"{name}: one process of one core", alone, "s"),
-        timed(f"{name}: two nodes of one core", together, "s"),
+        timed(f"{name}: two nodes of one core", parted, "s"),
         timed(f"{name}: times as fast", faster, "", minimum=SPEED),
     ]
 

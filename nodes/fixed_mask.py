@@ -16,7 +16,7 @@ from mvsgs_core.stats import Stats
 
 AHEAD = 64  # frames of a file that are read before the first goes out, at most
 AHEAD_BYTES = 128 * 2**20  # and their size
-MUCH = 0.3  # of an image: bars beside an upright video take more, but little else that a moving camera carries
+MUCH = 0.3  # of an image: bars beside an upright video take as much, but little else that a moving camera carries
 
 F = TypeVar("F", Frame, Item)
 
@@ -54,7 +54,7 @@ class FixedMask:
         self._parts.add(image)
         if self._parts.mask is not None and not self._said:
             self._said = True
-            much = ". So much may be what a camera that stands sees while something moves before it"
+            much = ". So much is bars beside a video, or what a camera that stands sees while something moves before it"
             self._stats.warn(
                 f"{100 * self._parts.share:.1f} % of the image is fixed to the camera, as bars, a logo, a car's hood "
                 "are: masked (dataset.hide_fixed=false: it is taken for the scene)"

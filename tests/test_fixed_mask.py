@@ -38,6 +38,18 @@ def test_the_first_frames_of_a_file_have_the_mask_as_well() -> None:
     assert len([w for w in stats.warnings if "fixed to the camera" in w and "hide_fixed=false" in w]) == 1
 
 
+@pytest.mark.parametrize(("part", "said"), [(0.25, True), (0.1, False)])
+def test_where_much_is_fixed_the_camera_may_stand(part: float, said: bool) -> None:
+    def bars(image: np.ndarray, number: int) -> None:
+        thick = round(part * image.shape[1])
+        image[:, :thick] = image[:, -thick:] = 0
+
+    stats = Stats()
+    assert len(list(FixedMask(stats, True).masked_ahead(items(EVERY + 5, bars)))) == EVERY + 5
+    (warning,) = [w for w in stats.warnings if "fixed to the camera" in w]
+    assert ("a camera that stands" in warning) == said
+
+
 def test_a_stream_without_any_waits_for_a_few_frames_only() -> None:
     source = iter(items(AHEAD, None))
     first = next(FixedMask(Stats(), True).masked_ahead(source))

@@ -13,7 +13,7 @@ from mvsgs_core.mapping.blocks.ray_cluster import ClusterError, RayCluster
 from mvsgs_core.mapping.mapper import OnlineMapper
 
 WORTH = 1.5  # times the iterations of the whole map that blocks of it may take in one process
-TOGETHER = 0.05  # of the iterations, those over the whole map
+TOGETHER = 0.05  # of the iterations, the last, over the whole map
 
 
 def refined_in_blocks(mapper: OnlineMapper, total: int) -> Iterator[None] | None:
@@ -42,24 +42,25 @@ def _here(
     mapper: OnlineMapper, total: int, parting: Parting, results: dict[int, Result] | None = None
 ) -> Iterator[None]:
     """results: of blocks that are done already."""
-    results = results or {}
+    results, blocks = results or {}, len(parting)
     for block, iterations in enumerate(iterations_of(mapper, parting, total)):
         if block in results:
             continue
-        for result in refined(job_of(mapper, parting, block, iterations, together(iterations)), mapper.config):
+        job = job_of(mapper, parting, block, iterations, together(iterations, blocks))
+        for result in refined(job, mapper.config):
             if result is not None:
                 results[block] = result
             yield
     merge(mapper, [results[block] for block in sorted(results)])
-    for done in range(total - together(total), total):
+    for done in range(total - together(total, blocks), total):
         mapper.refine(done, total)
         yield
-    mapper.log.values["blocks"] = len(parting)
+    mapper.log.values["blocks"] = blocks
 
 
-def together(iterations: int) -> int:
-    """Of a refinement's iterations, the last ones: of the whole map, no block's own."""
-    return round(TOGETHER * iterations)
+def together(iterations: int, blocks: int) -> int:
+    """Of a refinement's iterations, the last ones: of the whole map, no block's own. A single block has no seams."""
+    return round(TOGETHER * iterations) if blocks > 1 else 0
 
 
 def _on_cluster(mapper: OnlineMapper, total: int) -> Iterator[None]:
@@ -70,7 +71,9 @@ def _on_cluster(mapper: OnlineMapper, total: int) -> Iterator[None]:
         with mapper.log.time("refinement on Ray"), RayCluster(mapper.config.refine) as cluster:
             parting = parting_of(mapper, _blocks(mapper, cluster.machines))
             parts = iterations_of(mapper, parting, total)
-            jobs = (job_of(mapper, parting, block, each, together(each)) for block, each in enumerate(parts))
+            jobs = (
+                job_of(mapper, parting, block, each, together(each, len(parts))) for block, each in enumerate(parts)
+            )
             for finished in cluster.refined(jobs, plain(mapper.config)):
                 results.update(finished)
                 yield
