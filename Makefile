@@ -45,7 +45,7 @@ $(TOOLS): constraints.txt | check-system
 	@touch $@
 
 $(PACKAGES): $(TOOLS)
-	@echo "installing packages into .venv (some minutes; 4.2 GB, or gigabytes more with CUDA)"
+	@echo "installing packages into .venv (some minutes; 3.8 GB, or gigabytes more with CUDA)"
 	@$(PIP) --no-compile $(PIP_FLAGS) -r constraints.txt
 	@$(BIN)/python -m compileall -q -j 0 -x '/tests?/' .venv/lib > /dev/null 2>&1 || true
 	@touch $@
