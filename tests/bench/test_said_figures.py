@@ -113,8 +113,8 @@ def live() -> str:
 
 def quality() -> str:
     ahead = numbers("baselines", ": ours minus theirs, equal time")
-    said = [f"{ahead[scene]:.1f}" for scene in ("redkitchen", "tum_fr1_xyz")]
-    return f"Held-out frames of both real rooms are {said[0].removeprefix('0')} and {said[1]} dB better"
+    said = [f"{ahead[scene]:.1f}".removeprefix("0") for scene in ("redkitchen", "tum_fr1_xyz")]
+    return f"Held-out frames of both real rooms are {said[0]} and {said[1]} dB better"
 
 
 def quality_s_time() -> str:
