@@ -69,8 +69,9 @@ def frames(sequence: Sequence, fast: bool) -> Iterator[Frame]:
             time.sleep(max(0.0, began + item.timestamp - now))
         guessed, exposure = item.intrinsics_guessed, item.exposure
         yield Frame(
-            item.index, item.timestamp, item.image, item.intrinsics, guessed, exposure, place=item.place, mask=item.mask
-        )
+            item.index, item.timestamp, item.image, item.intrinsics, guessed, exposure, place=item.place,
+            mask=item.mask, world_from_cam=item.world_from_cam,
+        )  # fmt: skip
     for warning in sequence.warnings:
         say(f"warning: {warning}")
 

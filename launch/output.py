@@ -35,7 +35,7 @@ FOUND = ("map.ply", "localization.csv")  # either, a checkpoint or a pose is wor
 IMAGES, TRAJECTORY = "keyframes", "trajectory.txt"
 RESULTS = (  # all that a run leaves, but for the two files that say that it is one's
     *FOUND, FOLDER, TRAJECTORY, "report.html", "comparison.png", "cameras.json", "transforms.json", IMAGES,
-    "georeference.json",
+    "georeference.json", "given_frame.json",
 )  # fmt: skip
 RUN_ALL = Path(__file__).resolve().parent / "run_all.py"
 

@@ -11,7 +11,8 @@ from mvsgs_core.evaluation import metrics
 from mvsgs_core.evaluation.metrics import value
 
 FILES = ("report.html", "report.json", "map.ply", "cameras.json", "transforms.json", "keyframes", "trajectory.txt",
-         "localization.csv", "comparison.png", "georeference.json", "checkpoint", "config.yaml", "logs")  # fmt: skip
+         "localization.csv", "comparison.png", "georeference.json", "given_frame.json", "checkpoint",
+         "config.yaml", "logs")  # fmt: skip
 
 
 def summary(output: Path) -> str:

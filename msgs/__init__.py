@@ -93,11 +93,16 @@ class Frame(_Image):
     place: Annotated[np.ndarray, "float64 3"] | None = field(default=None, kw_only=True)
     # fx, fy, cx, cy of the image as the camera took it, before its undistortion and scaling; None: of this image
     original_intrinsics: Annotated[np.ndarray, "float64 4"] | None = field(default=None, kw_only=True)
+    # of a robot that knows where its camera is; a source sends it on as GroundTruth, and its Frames are without
+    world_from_cam: Annotated[np.ndarray, "float64 4 4"] | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True)
 class GroundTruth(_Image):
-    """What only the evaluator may see: the frame to score renders against, and the true pose and depth if known."""
+    """What only the evaluator may see: the frame to score renders against, and the true pose and depth if known.
+
+    And a tracker of given poses, see `nodes/posed_tracker.py`.
+    """
 
     world_from_cam: Annotated[np.ndarray, "float64 4 4"] | None
     depth: Annotated[np.ndarray, "float32 H W"] | None  # in the unit of the true poses

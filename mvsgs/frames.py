@@ -12,7 +12,7 @@ from msgs import Frame, GroundTruth
 from mvsgs_core.datasets.calibration import FISHEYE, check_lens_option, size_doubt
 from mvsgs_core.datasets.framing import Framing, Size
 from mvsgs_core.datasets.lens import Lens, guess_lens
-from mvsgs_core.mapping.keyframe_checks import is_pose
+from mvsgs_core.geometry import is_rigid
 from mvsgs_core.stream_times import LATEST
 from nodes.stream_frames import MAX_SIDE, MIN_SIDE
 
@@ -105,7 +105,7 @@ class Frames:
             raise ValueError(f"a pose is a (4, 4) matrix world_from_cam, got an array of shape {found.shape}")
         if not np.isfinite(found).all():
             raise ValueError("a pose with a value that is not finite: leave out frames that have none")
-        if not is_pose(found, 1.0):
+        if not is_rigid(found):
             raise ValueError("a pose that is no rotation and position: its last row is 0 0 0 1, its axes have length 1")
         return found
 

@@ -21,7 +21,7 @@ from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.export.source_camera import SourceCamera
 from mvsgs_core.export.splat import WRITERS
 from mvsgs_core.export.transforms import write_transforms
-from mvsgs_core.mapping.keyframe_checks import is_pose
+from mvsgs_core.geometry import is_rigid
 from mvsgs_core.rasterizer.interface import as_bytes
 
 CAMERAS = "cameras.json"
@@ -77,7 +77,7 @@ class GaussianMap:
         Raises ValueError for a pose or a camera that is none.
         """
         pose = np.asarray(world_from_cam, dtype=np.float64)
-        if pose.shape != (4, 4) or not is_pose(pose, 1.0):
+        if pose.shape != (4, 4) or not is_rigid(pose):
             raise ValueError("world_from_cam must be (4, 4): a rotation and a position, all finite")
         lens, size = self._camera(intrinsics, size)
         render = self.snapshot.render(pose, lens, size, near=near_plane(self.snapshot, pose))

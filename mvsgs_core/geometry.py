@@ -27,6 +27,16 @@ def rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
     return pose
 
 
+def is_rigid(pose: np.ndarray) -> bool:
+    """Whether (4, 4) is a rotation and a position, up to the rounding of who wrote it down."""
+    if not np.isfinite(pose).all():
+        return False
+    rotation = pose[:3, :3]
+    if np.abs(rotation).max() > 2.0 or not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]):
+        return False
+    return bool(np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0)
+
+
 def scaled(pose: np.ndarray, factor: float) -> np.ndarray:
     """Poses (..., 4, 4), their lengths multiplied."""
     result = np.array(pose, np.float64)
@@ -178,6 +188,13 @@ class Similarity:
     def apply(self, points: np.ndarray) -> np.ndarray:
         """Where points (N, 3) go, (N, 3)."""
         return np.asarray(self.scale * points @ self.rotation.T + self.translation)
+
+    def poses(self, world_from_cam: np.ndarray) -> np.ndarray:
+        """Where poses (N, 4, 4) go: they stay rigid."""
+        moved = np.array(world_from_cam, np.float64)
+        moved[:, :3, :3] = self.rotation @ moved[:, :3, :3]
+        moved[:, :3, 3] = self.apply(moved[:, :3, 3])
+        return moved
 
     def shifts(self, points: np.ndarray) -> np.ndarray:
         """Distances (N,) by which points (N, 3) move."""

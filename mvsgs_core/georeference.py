@@ -57,16 +57,10 @@ class Georeference:
     position_deviation: float  # m, of the whole map
     camera_up: bool = False  # the rotation about the path is not GPS's but that of cameras held upright
 
-    def world(self, positions: np.ndarray) -> np.ndarray:
-        """(N, 3) m east, north, up of positions in the map (N, 3)."""
-        return Similarity(self.scale, self.rotation, self.translation).apply(positions)
-
-    def poses(self, world_from_cam: np.ndarray) -> np.ndarray:
-        """(N, 4, 4) poses in the frame of east, north and up, in metres."""
-        moved = np.array(world_from_cam, np.float64)
-        moved[:, :3, :3] = self.rotation @ moved[:, :3, :3]
-        moved[:, :3, 3] = self.world(moved[:, :3, 3])
-        return moved
+    @property
+    def similarity(self) -> Similarity:
+        """From the map to metres east, north and up."""
+        return Similarity(self.scale, self.rotation, self.translation)
 
 
 def georeference(world_from_cam: np.ndarray, places: np.ndarray, camera_up: bool = False) -> Georeference:

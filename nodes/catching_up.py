@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from msgs import Frame
 from mvsgs_core.tracking.phase import Phase
 
+PASSED_OVER = "frames that newer ones overtook: not tracked"
 KEPT = 30  # frames that wait, at most: about a second
 HOP = 6  # frames that wait let one more of them be passed over
 
@@ -56,4 +57,4 @@ class CatchingUp:
         self._frames = []
 
 
-__all__ = ["KEPT", "CatchingUp"]
+__all__ = ["KEPT", "PASSED_OVER", "CatchingUp"]

@@ -15,16 +15,17 @@ from typing import Any, Literal
 import numpy as np
 
 from msgs import FusedKeyframe, GroundTruth, SplatMap, Trajectory
-from mvsgs_core import machine, trajectory, weights
+from mvsgs_core import given_frame, machine, trajectory, weights
 from mvsgs_core.atomic_file import replace_text, replacing
 from mvsgs_core.camera import told_readout_time
 from mvsgs_core.evaluation import html, pictures, statistics
 from mvsgs_core.evaluation.evaluation import Evaluation
 from mvsgs_core.evaluation.lpips import Lpips
 from mvsgs_core.evaluation.origin import origin
-from mvsgs_core.evaluation.trajectory_metrics import ALIGNED
+from mvsgs_core.evaluation.trajectory_metrics import ALIGNED, known_poses
 from mvsgs_core.georeference import FILE as GEOREFERENCE
 from mvsgs_core.georeference import Georeference, NoReferenceError, georeference, values_of, write_georeference
+from mvsgs_core.given_frame import GivenFrame, NoFrameError
 from mvsgs_core.held_out import HELD_OUT_EVERY
 from mvsgs_core.passwords import without_passwords
 from mvsgs_core.trajectory_file import write_trajectory
@@ -99,13 +100,13 @@ class Evaluator(Node):
             self.report = self.evaluation.report()
         self.stats.seconds["fitting at test time"] = self.evaluation.fitting
         self.stats.seconds["scoring"] -= self.evaluation.fitting
-        found = self._georeference()
+        placed, given = self._georeference(), self._given_frame()
         self._add_statistics()
         for note in self.report["notes"]:
             self.stats.warn(note)
         self.report = without_passwords(self.report)
         if self.folder:
-            self._write(self.folder, found)
+            self._write(self.folder, placed, given)
         self.evaluation.close()
         yield from ()
 
@@ -127,6 +128,21 @@ class Evaluator(Node):
                 f"GPS places that do not fit the trajectory, left out: {found.outliers} of {found.positions}, off by "
                 f"up to {found.farthest:.0f} m; where they follow each other, GPS drifted or the trajectory is bent"
             )
+        return found
+
+    def _given_frame(self) -> GivenFrame | None:
+        """Where the map lies in the frame of poses that came with the frames; None, and said why, where they do not
+        tell."""
+        track = self.evaluation.final_trajectory
+        if track is None or not self.evaluation.truth:
+            return None
+        poses = known_poses(track, self.evaluation.truth, self.evaluation.keyframes)
+        try:
+            found = given_frame.given_frame(poses.estimate, poses.truth)
+        except NoFrameError as error:
+            self.stats.warn(f"the poses that came with the frames do not tell where the map lies: {error}")
+            return None
+        self.report["given_frame"] = given_frame.values_of(found)
         return found
 
     def _load_lpips(self) -> Lpips | None:
@@ -166,7 +182,7 @@ class Evaluator(Node):
             f"{_masked(self.evaluation.masked)}{_aligned(self.report['trajectory'])}"
         )
 
-    def _write(self, folder: Path, placed: Georeference | None) -> None:
+    def _write(self, folder: Path, placed: Georeference | None, given: GivenFrame | None) -> None:
         """Each file in one step; the room that the frames took on disk is given back before.
 
         report.json comes last: it says that the run has finished, and then nobody goes on with it.
@@ -191,6 +207,8 @@ class Evaluator(Node):
                 pictures.write_sheet(aside, comparisons)
         if placed is not None:
             write_georeference(folder / GEOREFERENCE, placed)
+        if given is not None:
+            given_frame.write_given_frame(folder / given_frame.FILE, given)
         replace_text(folder / "report.json", json.dumps(_plain(self.report), indent=1, allow_nan=False))
 
 

@@ -9,9 +9,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
+
 from msgs import End, Frame, GroundTruth
 from mvsgs_core.datasets.masks import CameraMask
 from mvsgs_core.datasets.options import SizedSelection
+from mvsgs_core.geometry import is_rigid
 from nodes import Node
 from nodes.fixed_mask import FixedMask
 from nodes.stream_frames import StreamFrames
@@ -61,13 +64,14 @@ class LiveSource(Node, ABC):
                 if self.config.has(taken):
                     shown = replace(
                         fixed.masked(self._framed(frame)), index=index, captured=came,
-                        original_intrinsics=frame.intrinsics,
+                        original_intrinsics=frame.intrinsics, world_from_cam=None,
                     )  # fmt: skip
                     self.stats.count("frames")
                     yield shown
                     yield GroundTruth(
-                        index, shown.timestamp, shown.image, shown.intrinsics, None, None, mask=shown.mask
-                    )
+                        index, shown.timestamp, shown.image, shown.intrinsics, self._given_pose(frame), None,
+                        mask=shown.mask,
+                    )  # fmt: skip
                     index += 1
                 taken += 1
         finally:
@@ -89,6 +93,15 @@ class LiveSource(Node, ABC):
             told = self.stats.warnings[self._told_before :]
             raise TimeoutError(f"{silence}: {self._frames.refused or next(iter(told), self._hint())}")
         self.stats.warn(f"{silence}: the stream ends here")
+        return None
+
+    def _given_pose(self, frame: Frame) -> np.ndarray | None:
+        """(4, 4) world_from_cam, where the sender knows it."""
+        pose = frame.world_from_cam
+        if pose is None or is_rigid(pose):
+            return pose
+        text = f"poses of {self._sender} that are no rotation and position (4x4, last row 0 0 0 1) were left out"
+        self.stats.refuse("poses", 1, text)
         return None
 
     @property

@@ -1,4 +1,4 @@
-"""Frame, GroundTruth -> Keyframe, TrackedFrame, Poses, Trajectory: given poses, to measure later stages alone."""
+"""Frame, GroundTruth -> Keyframe, TrackedFrame, Poses, Trajectory: poses that are given, a data set's or a robot's."""
 
 from __future__ import annotations
 
@@ -16,19 +16,21 @@ from mvsgs_core.tracking.posed import PosedTracker as CoreTracker
 from mvsgs_core.tracking.publish import affine_of, changed_vignetting, differ
 from mvsgs_core.trajectory import velocities
 from nodes import Node
+from nodes.catching_up import PASSED_OVER
 from nodes.tracked_messages import keyframe_message, tracked_frame_message
 from nodes.tracking import keep_place, places_of, refused, warn_of_guessed_focal
 
 
 class PosedTracker(Node):
-    """The two inputs are joined by index, in whatever order they come; scale is always 1.
+    """The two inputs are joined by index, in whatever order they come; scale is always 1. A live stream's frames may
+    be overtaken: what came with them is forgotten.
 
     Poses say what exposures and vignetting are now: the poses in them stay.
     """
 
     @dataclass(frozen=True)
     class Config(PosedConfig):
-        pass
+        realtime: bool = False  # of the frames that wait, the newest alone
 
     config: Config
 
@@ -36,7 +38,7 @@ class PosedTracker(Node):
         super().__init__(config)
         self._core: CoreTracker | None = None  # from the first frame with a pose on
         self._frames: dict[int, Frame] = {}  # without their truth yet, or keyframes that are not complete
-        self._truths: dict[int, GroundTruth] = {}  # without their frames yet
+        self._given: dict[int, np.ndarray | None] = {}  # poses (4, 4) without their frames yet
         self._joined: dict[int, tuple[float, np.ndarray]] = {}  # timestamp and pose (4, 4), NaN where there is none
         self._keyframes: dict[int, np.ndarray | None] = {}  # with the exposure (3, 4) that was sent
         self._known: dict[int, object] = {}  # of the same, what their exposures were made of when they were looked at
@@ -50,13 +52,15 @@ class PosedTracker(Node):
 
     def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses | TrackedFrame]:
         self._frames[frame.index] = frame
+        for overtaken in [index for index in self._given if index < frame.index]:  # of a live stream
+            del self._given[overtaken]
         keep_place(self._places, frame)
         warn_of_guessed_focal(self.stats, frame)
-        if frame.index in self._truths:
+        if frame.index in self._given:
             yield from self._join(frame.index)
 
     def on_ground_truth(self, truth: GroundTruth) -> Iterator[Keyframe | Poses | TrackedFrame]:
-        self._truths[truth.index] = truth
+        self._given[truth.index] = truth.world_from_cam
         if truth.index in self._frames:
             yield from self._join(truth.index)
 
@@ -71,7 +75,8 @@ class PosedTracker(Node):
             self.stats.nothing(
                 f"no frame came with a true pose, of {len(self._joined)} frames: tracker=dense needs none"
             )
-        if self._truths or self._frames.keys() - self._joined.keys():
+        newest = max(self._joined, default=-1)
+        if any(index > newest for index in self._given) or self._frames.keys() - self._joined.keys():
             self.stats.warn("some frames came without ground truth, or ground truth without a frame")
         n = len(self._joined)
         if len(self._keyframes) < 2 <= n:
@@ -99,7 +104,11 @@ class PosedTracker(Node):
         )
 
     def _join(self, index: int) -> Iterator[Keyframe | Poses | TrackedFrame]:
-        frame, pose = self._frames[index], self._truths.pop(index).world_from_cam
+        frame, pose = self._frames[index], self._given.pop(index)
+        if self.config.realtime and max(self._frames) > index:
+            self.stats.skip(PASSED_OVER)
+            del self._frames[index]
+            return
         self._joined[index] = (frame.timestamp, np.full((4, 4), np.nan) if pose is None else pose)
         if pose is None:
             self.stats.skip("frames without a true pose")

@@ -19,13 +19,12 @@ from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity
 from mvsgs_core.tracking.matching.flow import check_flow
 from mvsgs_core.tracking.publish import Correction, Update
 from mvsgs_core.tracking.tracker import Tracker as CoreTracker
-from nodes.catching_up import KEPT, CatchingUp
+from nodes.catching_up import KEPT, PASSED_OVER, CatchingUp
 from nodes.localization_file import LocalizationFile
 from nodes.returning import Returning
 from nodes.tracked_messages import keyframe_message, tracked_frame_message
 from nodes.tracking import TrackerNode
 
-PASSED_OVER = "frames that newer ones overtook: not tracked"
 ONLY_LOCALIZES = "this run only localizes: begin one with map=DIR and without mapper=frozen, and switch by localize"
 
 

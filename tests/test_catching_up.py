@@ -10,11 +10,11 @@ import pytest
 
 from msgs import Frame, Trajectory
 from mvsgs_core.tracking.phase import Phase
-from nodes.catching_up import HOP, KEPT, CatchingUp
+from nodes.catching_up import HOP, KEPT, PASSED_OVER, CatchingUp
 from nodes.reader import Reader
 from nodes.runtime.transport.publisher import Publisher
 from nodes.runtime.transport.readers import NewestReader
-from nodes.tracker import PASSED_OVER, Tracker
+from nodes.tracker import Tracker
 from tests.support.patience import LONG, until
 from tests.support.shared_data import shared
 

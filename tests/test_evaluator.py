@@ -72,6 +72,7 @@ def test_files(evaluator: Evaluator) -> None:
         "report.html",
         "comparison.png",
         "trajectory.txt",
+        "given_frame.json",
     }
     html = (evaluator.folder / "report.html").read_text()
     assert html.count("data:image/jpeg;base64,") == 10  # four of each of the two held-out frames, and a depth map
@@ -87,7 +88,9 @@ def places_along() -> np.ndarray:
     return np.stack([z / degree + 1e-7, x / degree, -y], axis=1)
 
 
-@pytest.mark.parametrize("last", ["write_trajectory", "pictures.write_sheet", "write_georeference"])
+@pytest.mark.parametrize(
+    "last", ["write_trajectory", "pictures.write_sheet", "write_georeference", "given_frame.write_given_frame"]
+)
 def test_a_report_that_is_there_says_that_the_other_files_are(
     evaluator: Evaluator, monkeypatch: pytest.MonkeyPatch, last: str
 ) -> None:

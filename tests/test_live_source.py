@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from msgs import Frame
+from msgs import Frame, GroundTruth
 from nodes.live import LiveSource
 
 HINT = "is it switched on?"
@@ -57,6 +57,23 @@ def test_the_original_image_is_the_one_that_comes_whatever_its_sender_says() -> 
     assert frame.intrinsics.tolist() == (came / 2).tolist()
     assert frame.original_intrinsics is not None
     assert frame.original_intrinsics.tolist() == came.tolist()
+
+
+def test_a_pose_that_comes_with_a_frame_goes_apart_from_it_and_one_that_is_none_is_left_out() -> None:
+    node, pose = Brief(Brief.Config(stop=2)), np.eye(4)
+    pose[:3, 3] = [1.0, 2.0, 3.0]
+    image, lens = np.zeros((24, 32, 3), np.uint8), np.array([25.0, 25, 15.5, 11.5])
+    node.comes = lambda number: Frame(
+        0, float(number), image + np.uint8(number), lens, world_from_cam=pose if number == 1 else 2.0 * pose
+    )
+    sent = list(node.run())
+    assert [message.world_from_cam for message in sent if isinstance(message, Frame)] == [None, None]
+    first, second = (message.world_from_cam for message in sent if isinstance(message, GroundTruth))
+    assert first is not None
+    assert np.array_equal(first, pose)
+    assert second is None
+    assert node.stats.counts["refused_poses"] == 1
+    assert any("no rotation and position" in text for text in node.stats.warnings)
 
 
 def test_it_is_what_was_wrong_with_the_first_frame_not_that_none_came_after_it() -> None:

@@ -52,7 +52,7 @@ class Evaluation:
         self._with_depth: set[int] = set()  # keyframes whose filtered depth came
         self.size: tuple[int, int] | None = None  # height, width of the first frame
         self._intrinsics: np.ndarray | None = None  # (4,) of the first frame
-        self._truth: dict[int, np.ndarray] = {}
+        self.truth: dict[int, np.ndarray] = {}  # poses (4, 4), by frame index
 
     def add_frame(
         self,
@@ -76,7 +76,7 @@ class Evaluation:
         if mask is not None:
             self.masked.append(1.0 - float(mask.mean()))
         if world_from_cam is not None and np.isfinite(world_from_cam).all():
-            self._truth[index] = world_from_cam
+            self.truth[index] = world_from_cam
 
     def add_keyframe(
         self, index: int, image: np.ndarray, intrinsics: np.ndarray, depth: np.ndarray, scale: float,
@@ -291,7 +291,7 @@ class Evaluation:
     def _score_trajectory(self, notes: list[str]) -> tuple[geometry.Similarity | None, dict[str, Any]]:
         trajectory = self.final_trajectory or Trajectory.empty()
         notes += self._about_trajectory()
-        poses = known_poses(trajectory, self._truth, self.keyframes)
+        poses = known_poses(trajectory, self.truth, self.keyframes)
         posed, shown = int(trajectory.posed.sum()), int(trajectory.main(self.keyframes).sum())
         if shown < posed:
             notes.append(
@@ -306,7 +306,7 @@ class Evaluation:
             found = poses.alignment
         except ValueError as error:
             if self.trajectory is not None or len(trajectory.index):
-                notes.append(f"no trajectory error: {error if self._truth else 'no true poses'}")
+                notes.append(f"no trajectory error: {error if self.truth else 'no true poses'}")
             unknown = {"path_length": None, "scale": None}
             return None, {**metrics.of_all(metrics.TRAJECTORY, None), **unknown, **counts}
         length = {"path_length": poses.path_length, "scale": found.scale}
@@ -339,7 +339,7 @@ class Evaluation:
         if trajectory is None or not trajectory.posed.any():
             return None
         alignment, _ = self._score_trajectory([])
-        return trajectory_metrics.aligned_path(trajectory, self._truth, alignment, self.keyframes)
+        return trajectory_metrics.aligned_path(trajectory, self.truth, alignment, self.keyframes)
 
     def _score_depths(self, alignment: geometry.Similarity | None, notes: list[str]) -> dict[str, Any]:
         """After one scale for the whole run, the median ratio of true to estimated depth, as is usual for monocular

@@ -3,7 +3,8 @@
 OUT decides: gaussians.ply (--fold, for viewers without shapes), .splat, .spz, a mesh (.glb, .obj, or --mesh with .ply),
 a folder for a COLMAP model, with --images and --observations where they are wanted, transforms.json for nerfstudio,
 cameras.json, or trajectory.txt (TUM format). Mesh, model and these are of the keyframes in the cameras.json beside the
-map, or of a --trajectory. --frame enu: in metres east, north and up, where the run had GPS.
+map, or of a --trajectory. --frame enu: in metres east, north and up, where the run had GPS; given: in the frame and
+unit of the poses that came with its frames.
 """
 
 from __future__ import annotations
@@ -23,21 +24,14 @@ from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.cameras import Cameras, read_source_camera, write_cameras
 from mvsgs_core.export.colmap import write_colmap
 from mvsgs_core.export.command_line import cameras_of_map, input_arguments, read_map, run
-from mvsgs_core.export.earth import (
-    cameras_on_earth,
-    in_axes_of,
-    on_earth,
-    reference_of,
-    write_origin,
-)
 from mvsgs_core.export.image_sizes import check_sizes
 from mvsgs_core.export.mesh import write_mesh
+from mvsgs_core.export.other_frame import FILES, cameras_in_frame, in_axes_of, in_frame, reference_of, told
 from mvsgs_core.export.ply import relative_origin, write_ply
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.export.splat import WRITERS, spz_origin
 from mvsgs_core.export.transforms import write_transforms
 from mvsgs_core.export.turning import RUB_FROM_RDF
-from mvsgs_core.georeference import FILE as GEOREFERENCE
 from mvsgs_core.trajectory_file import write_trajectory
 
 BESIDE = Path()  # --images without a folder: those beside the map
@@ -46,7 +40,7 @@ BESIDE = Path()  # --images without a folder: those beside the map
 def posed_cameras(options: argparse.Namespace) -> Cameras:
     """Those of the map, in the frame that is written."""
     found = cameras_of_map(options)
-    return found if options.reference is None else cameras_on_earth(found, options.reference)
+    return found if options.place is None else cameras_in_frame(found, options.place)
 
 
 def splats(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
@@ -154,7 +148,8 @@ def _check_not_read(out: Path, options: argparse.Namespace) -> None:
     if not out.absolute().parent.is_dir():
         raise ValueError(f"{out}: there is no folder {out.parent}")
     cameras = options.cameras or options.map.with_name("cameras.json")
-    for path in filter(None, (options.map, cameras, options.trajectory, options.map.with_name(GEOREFERENCE))):
+    beside = [options.map.with_name(name) for name in FILES]
+    for path in filter(None, (options.map, cameras, options.trajectory, *beside)):
         if path.exists() and out.resolve() == path.resolve():
             raise ValueError(f"{out} is read for this export, which would replace it: give another file")
 
@@ -173,12 +168,12 @@ def export(options: argparse.Namespace, unset: Callable[[str], object]) -> str:
     _check_not_read(out, options)
     out = out.resolve() if out.is_symlink() else out  # what it leads to is replaced, and not the link
     final, left_out = read_map(options)
-    options.reference = found = reference_of(options)
+    found, options.place = reference_of(options), None
     if found is None:
         return f"{out}: {write(out, final.scaled(options.scale), options)}{left_out}"
-    options.reference, axes = in_axes_of(out, found)
-    said = write(out, on_earth(final, options.reference), options)
-    return f"{out}: {said}{left_out}; {axes}, in metres, of the place in {write_origin(out, found, axes)}"
+    options.place, axes = in_axes_of(out, found, final.world_from_cam)
+    said = write(out, in_frame(final, options.place), options)
+    return f"{out}: {said}{left_out}; {told(out, found, axes)}"
 
 
 def main(arguments: list[str] | None = None, prog: str = "python -m mvsgs_core.export") -> int:
@@ -200,8 +195,9 @@ def main(arguments: list[str] | None = None, prog: str = "python -m mvsgs_core.e
     parser.add_argument("--voxel", type=float, default=0.01, help="of the mesh, in median depths")
     parser.add_argument("--scale", type=float, default=1.0, help="factor on all lengths")
     parser.add_argument(
-        "--frame", choices=("map", "enu"), default="map",
-        help="enu: metres east, north and up, where the run had GPS; OUT.origin.json says of which place",
+        "--frame", choices=("map", "enu", "given"), default="map",
+        help="enu: metres east, north and up, where the run had GPS; OUT.origin.json says of which place; given: "
+        "that of the poses that came with the frames, as a robot's odometry",
     )  # fmt: skip
     return run(parser, arguments, partial(export, unset=parser.get_default))
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from mvsgs_core.camera import FOCAL_RANGE, is_near_middle, is_readout_time
+from mvsgs_core.geometry import is_rigid
 from mvsgs_core.mapping.frame_of_reference import FAR
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.stats import Stats
@@ -52,12 +53,7 @@ def is_read_out(velocity: np.ndarray | None, readout_time: float) -> bool:
 
 def is_pose(world_from_cam: np.ndarray, scale: float) -> bool:
     """Whether that is a rigid transform (4, 4), and the scale one that a map may have."""
-    if not (np.isfinite(world_from_cam).all() and 1.0 / FAR < scale < FAR):
-        return False
-    rotation = world_from_cam[:3, :3]
-    if np.abs(rotation).max() > 2.0 or not np.array_equal(world_from_cam[3], [0.0, 0.0, 0.0, 1.0]):
-        return False
-    return bool(np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0)
+    return 1.0 / FAR < scale < FAR and is_rigid(world_from_cam)
 
 
 def _problem(view: RGBDKeyframe) -> str:

@@ -52,7 +52,7 @@ def test_noise_and_false_places_leave_the_similarity_and_are_said() -> None:
     assert found.outliers == len(false)
     assert found.positions == 40
     assert 5.0 < found.residual < 12.0  # the median distance of 5 m an axis is 7.7 m, a quarter is far off
-    off = found.world(poses[:, :3, 3]) - (metres - geodesy.east_north_up(found.origin[None], ORIGIN))
+    off = found.similarity.apply(poses[:, :3, 3]) - (metres - geodesy.east_north_up(found.origin[None], ORIGIN))
     turned = found.rotation @ TURN.T
     angle = np.degrees(np.linalg.norm(geometry.so3_log(turned[None])))
     assert abs(found.scale / SCALE - 1.0) < 3.0 * found.scale_deviation < 0.06
@@ -119,10 +119,8 @@ def test_on_a_line_the_roll_is_the_cameras_only_if_said() -> None:
     found = georeference(poses, places, camera_up=True)
     assert found.camera_up
     assert np.degrees(np.linalg.norm(geometry.so3_log((found.rotation @ TURN.T)[None]))) < 1.0
-    assert (
-        np.median(np.linalg.norm(found.world(poses[:, :3, 3]) - geodesy.east_north_up(places, found.origin), axis=1))
-        < 3
-    )
+    off = found.similarity.apply(poses[:, :3, 3]) - geodesy.east_north_up(places, found.origin)
+    assert np.median(np.linalg.norm(off, axis=1)) < 3
     upward, high, _ = flight(40, (0.0, 0.0, 300.0), noise=1.0)
     with pytest.raises(NoReferenceError, match="too steep"):
         georeference(upward, high, camera_up=True)
