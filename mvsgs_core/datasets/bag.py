@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.datasets import Item, dataset
 from mvsgs_core.datasets.bag_file import is_bag_folder, messages, opened_bag
 from mvsgs_core.datasets.bag_lens import INFO, LensInTime, first_lens, info_topics
+from mvsgs_core.datasets.bag_poses import poses_in
 from mvsgs_core.datasets.calibration import lens_from_option
 from mvsgs_core.datasets.cut_off_bag import CutOffBag
 from mvsgs_core.datasets.files import Layout
@@ -53,6 +54,9 @@ class Bag(FileReader):
 
     topic: str | None = None  # of the images; null: the only color one
     info_topic: str | None = None  # of their calibration; null: camera_info beside the images
+    # odom, map: poses are those of the camera in this frame of the bag's /tf, by its own odometry; null: there are none
+    fixed_frame: str | None = None
+    camera_frame: str | None = None  # the camera's in /tf, x right, y down, z forward; null: as its images name it
 
     @staticmethod
     def recognizes(path: Path) -> bool:
@@ -66,10 +70,12 @@ class Bag(FileReader):
             self._notices += bag.warnings if isinstance(bag, CutOffBag) else []
             self._topic = _image_topic(bag, self.topic)
             self._count = sum(c.msgcount for c in bag.connections if c.topic == self._topic)
-            lens, native = None, _first_size(bag, self._topic)
+            (native, frame), lens = _first_image(bag, self._topic), None
             if self.intrinsics is None:
                 infos = info_topics(bag, self._topic, self.info_topic, self._notices)
                 lens = first_lens(bag, infos, rectified(self._topic), self._notices)
+            camera = frame if self.camera_frame is None else self.camera_frame
+            self._poses = None if self.fixed_frame is None else poses_in(bag, camera, self.fixed_frame, self._notices)
             self._info_topic = None if lens is None else infos[0].topic
             if lens is None:
                 given = "auto" if self.intrinsics is None else self.intrinsics
@@ -175,6 +181,7 @@ class Bag(FileReader):
             place=self._place(stamp),
             mask=mask,
             original=np.array(original.at(self._lens.size).intrinsics, np.float64),
+            world_from_cam=None if self._poses is None else self._poses.at(stamp, self._notices),
         )
 
 
@@ -192,7 +199,8 @@ def _image_topic(bag: OpenBag, given: str | None) -> str:
     raise ValueError(f"the bag has several image topics; set dataset.options.topic to one of: {', '.join(topics)}")
 
 
-def _first_size(bag: OpenBag, topic: str) -> tuple[int, int]:
+def _first_image(bag: OpenBag, topic: str) -> tuple[tuple[int, int], str]:
+    """Its height and width, and the name of its camera's frame of reference."""
     found = Notices()  # reading the sequence reports it, where one can be read
     for connection, _, data in messages(bag, [c for c in bag.connections if c.topic == topic], found):
         try:
@@ -200,7 +208,8 @@ def _first_size(bag: OpenBag, topic: str) -> tuple[int, int]:
         except BadFileError as error:
             found.tally("images that could not be read", str(error))
             continue
-        return image.shape[0], image.shape[1]
+        message: Any = bag.deserialize(data, connection.msgtype)
+        return (image.shape[0], image.shape[1]), message.header.frame_id
     raise BadFileError(": ".join([f"no image of {topic} can be read", *found]))
 
 

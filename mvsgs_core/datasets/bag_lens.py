@@ -41,19 +41,20 @@ def info_topics(bag: OpenBag, topic: str, given: str | None, notices: Notices) -
 
 def first_lens(bag: OpenBag, topics: list[BagTopic], rectified: bool, notices: Notices) -> Lens | None:
     """The lens of the first of these messages that says anything; None without topics, and, said in `notices`, where
-    none does.
+    none does. Damage before it is not: reading the sequence reports it.
 
     rectified: ROS has undistorted the images already. Raises BadFileError for one that no camera has.
     """
     if not topics:
         return None
-    topic = topics[0].topic
-    for _, _, data in islice(messages(bag, topics, notices), _TRIED):
+    topic, damage = topics[0].topic, Notices()
+    for _, _, data in islice(messages(bag, topics, damage), _TRIED):
         with reading(topic, "in the bag is no camera_info that can be used; set dataset.intrinsics=[fx,fy,cx,cy]"):
             info = bag.deserialize(data, INFO)
             if calibrated(info):
                 return lens_of(info, rectified)
-    notices.append(f"no calibration: {topic} in the bag is empty, the camera was not calibrated")
+    what = f"could not be read: {'; '.join(damage)}" if damage else "is empty, the camera was not calibrated"
+    notices.append(f"no calibration: {topic} in the bag {what}")
     return None
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mvsgs_core import geodesy
-from mvsgs_core.datasets.files import UnreadableImageError, opened_image, upright_size
+from mvsgs_core.datasets.files import UnreadableImageError, exif_of, opened_image, upright_size
 from mvsgs_core.datasets.lens import Lens
 
 _EXIF_IFD = 0x8769
@@ -41,7 +41,7 @@ def read_exif_lens(path: Path, *, turn_upright: bool = True) -> Lens | None:
     """
     try:
         with opened_image(path, path.name) as image:
-            header = image.getexif().get_ifd(_EXIF_IFD)
+            header = exif_of(image).get_ifd(_EXIF_IFD)
             height, width = upright_size(image) if turn_upright else (image.height, image.width)
     except UnreadableImageError:
         return None  # reading the sequence reports it
@@ -58,7 +58,7 @@ def exif_doubt(path: Path) -> str:
     """What to say of a header that names two focal lengths, or one that is hardly true; empty where it does not."""
     try:
         with opened_image(path, path.name) as image:
-            _, doubt = _focal_length(image.getexif().get_ifd(_EXIF_IFD), (image.height, image.width))
+            _, doubt = _focal_length(exif_of(image).get_ifd(_EXIF_IFD), (image.height, image.width))
     except UnreadableImageError:
         return ""
     return f"EXIF of {path.name} {doubt}" if doubt else ""
@@ -93,11 +93,7 @@ def read_exif_time(path: Path) -> datetime | None:
 
     None where the header lacks it, or cannot be read.
     """
-    try:
-        with opened_image(path, path.name) as image:
-            header = image.getexif().get_ifd(_EXIF_IFD)
-    except UnreadableImageError:
-        return None
+    header = _part(path, _EXIF_IFD)
     text, fraction, offset = (_text(header.get(tag)) for tag in (_TAKEN, _TAKEN_FRACTION, _TAKEN_OFFSET))
     day, _, time = text.partition(" ")
     seconds = f".{fraction[:6]}" if fraction.isdecimal() else ""
@@ -109,6 +105,15 @@ def read_exif_time(path: Path) -> datetime | None:
     return None
 
 
+def _part(path: Path, tag: int) -> dict[int, object]:
+    """What the header has at `tag`; nothing where it cannot be read."""
+    try:
+        with opened_image(path, path.name) as image:
+            return exif_of(image).get_ifd(tag)
+    except UnreadableImageError:
+        return {}
+
+
 def _text(value: object) -> str:
     text = value.decode("ascii", "replace") if isinstance(value, bytes) else value
     return text.replace("\0", " ").strip() if isinstance(text, str) else ""
@@ -116,11 +121,7 @@ def _text(value: object) -> str:
 
 def read_exif_exposure(path: Path) -> float:
     """Exposure time (s) times ISO over the f-number squared; 0 where the header lacks one of them or cannot be read."""
-    try:
-        with opened_image(path, path.name) as image:
-            header = image.getexif().get_ifd(_EXIF_IFD)
-    except UnreadableImageError:
-        return 0.0
+    header = _part(path, _EXIF_IFD)
     sensitivity = header.get(_SENSITIVITY)
     if isinstance(sensitivity, tuple):  # of several kinds, the first is the one that counts
         sensitivity = sensitivity[0] if sensitivity else None
@@ -135,11 +136,7 @@ def read_exif_place(path: Path) -> np.ndarray | None:
 
     None where the header lacks a place, has one that can be none, or cannot be read.
     """
-    try:
-        with opened_image(path, path.name) as image:
-            header = image.getexif().get_ifd(_GPS_IFD)
-    except UnreadableImageError:
-        return None
+    header = _part(path, _GPS_IFD)
     latitude, longitude = _angle(header, _LATITUDE, "NS"), _angle(header, _LONGITUDE, "EW")
     if latitude is None or longitude is None:
         return None

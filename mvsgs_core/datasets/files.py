@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import importlib
+import io
 import math
 import os
 import re
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, BinaryIO
 
 import numpy as np
 from PIL import Image, ImageFile, ImageOps
@@ -24,6 +26,7 @@ _HEIF = (".heic", ".heif")  # as phones take them
 MAX_PIXELS = 2**27  # of one image: 134 million, more than cameras of 100 million have
 _FORMATS = ("JPEG", "PNG", "BMP", "TIFF", "WEBP", "PPM", "AVIF")  # of these suffixes; Pillow knows 40 more
 _ORIENTATION = 0x0112  # EXIF tag
+_PNG_HEADER = (b"IHDR", b"eXIf", b"iTXt", b"tEXt", b"zTXt", b"IEND")  # chunks in which Pillow finds EXIF and XMP
 
 Image.MAX_IMAGE_PIXELS = MAX_PIXELS  # Pillow's own bound, of what it decodes inside of other formats, is the same
 
@@ -140,15 +143,41 @@ def dark_16_bit(paths: Sequence[Path]) -> bool:
     return deep
 
 
-def upright_size(image: Image.Image) -> tuple[int, int]:
+def exif_of(image: ImageFile.ImageFile) -> Image.Exif:
+    """The EXIF header of an opened image, without decoding it. In a PNG it may come after the pixels, which Pillow's
+    own `getexif` decodes to find it."""
+    if image.format != "PNG":
+        return image.getexif()
+    assert image.fp is not None
+    with Image.open(_without_pixels(image.fp), formats=("PNG",)) as header:
+        return Image.Image.getexif(header)  # that of all formats, which decodes nothing
+
+
+def _without_pixels(file: IO[bytes]) -> BinaryIO:
+    """Of a PNG file the chunks of its header, wherever they are: all others are stepped over by their lengths."""
+    place, header, kind = file.tell(), io.BytesIO(), b""
+    file.seek(0)
+    header.write(file.read(8))  # its magic number
+    while kind != b"IEND" and len(head := file.read(8)) == 8:
+        length, kind = struct.unpack(">I4s", head)
+        if kind in _PNG_HEADER:
+            header.write(head + file.read(length + 4))  # with its checksum
+        else:
+            file.seek(length + 4, os.SEEK_CUR)
+    file.seek(place)
+    header.seek(0)
+    return header
+
+
+def upright_size(image: ImageFile.ImageFile) -> tuple[int, int]:
     """(height, width) of an opened image as EXIF says it should be shown, without decoding it."""
     width, height = image.size
     return (width, height) if is_turned(image) else (height, width)
 
 
-def is_turned(image: Image.Image) -> bool:
+def is_turned(image: ImageFile.ImageFile) -> bool:
     """Whether EXIF says that an opened image should be shown with a quarter turn, without decoding it."""
-    return image.getexif().get(_ORIENTATION, 1) in (5, 6, 7, 8)
+    return exif_of(image).get(_ORIENTATION, 1) in (5, 6, 7, 8)
 
 
 def read_depth(path: Path, per_unit: float, invalid: tuple[int, ...] = (0,)) -> np.ndarray:
@@ -157,7 +186,7 @@ def read_depth(path: Path, per_unit: float, invalid: tuple[int, ...] = (0,)) -> 
     Raises UnreadableImageError, for counts of 8 bits and for fractions too, which count by another unit.
     """
     with opened_image(path, path.name) as opened:
-        counts = np.asarray(opened)
+        counts = np.asarray(_unstretched(opened))
     if counts.ndim != 2:
         raise UnreadableImageError(f"{path.name}: a depth map has one channel, this one is {counts.shape}")
     if counts.dtype.kind not in "iu" or counts.dtype.itemsize < 2:
@@ -169,6 +198,16 @@ def read_depth(path: Path, per_unit: float, invalid: tuple[int, ...] = (0,)) -> 
     depth = (counts / per_unit).astype(np.float32)
     depth[np.isin(counts, invalid) | ~(depth > 0) | np.isinf(depth)] = 0.0
     return depth
+
+
+def _unstretched(image: ImageFile.ImageFile) -> Image.Image:
+    """An opened image of integers with the values that are in its file. Pillow makes the maximum that a .pgm names
+    65535, unless it is told that this is the maximum."""
+    if image.mode == "I":
+        image.tile = [
+            tile._replace(args=("I", 65535)) if tile.codec_name.startswith("ppm") else tile for tile in image.tile
+        ]
+    return image
 
 
 def read_array(path: Path) -> np.ndarray:

@@ -26,8 +26,11 @@ def read_mask(path: Path, *, turn_upright: bool = True) -> np.ndarray:
     """(H, W) bool, True where a pixel counts. turn_upright: as its image is read. Raises UnreadableImageError."""
     with opened_image(path, path.name) as opened:
         image = ImageOps.exif_transpose(opened) if turn_upright else opened
-        values = np.asarray(image if image.mode in ("1", "L") or image.mode.startswith("I") else image.convert("L"))
-    return np.asarray(values >= 128 if path.suffix.lower() in _LOSSY else values > 0)
+        if path.suffix.lower() in _LOSSY:
+            return np.asarray(image.convert("L")) >= 128
+        one = image.mode in ("1", "L", "F") or image.mode.startswith("I")
+        values = np.asarray(image if one else image.convert("RGB"))  # gray would be 0 where a color is dark
+    return np.asarray(values > 0 if one else values.any(axis=-1))
 
 
 def read_alpha(path: Path, *, turn_upright: bool = True) -> np.ndarray | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from mvsgs_core.atomic_file import replace_text
 from mvsgs_core.datasets import Item
 from mvsgs_core.datasets.synthetic import Synthetic
 from mvsgs_core.geometry import quaternion_from_rotation
@@ -24,17 +26,20 @@ UNITS_PER_METER = 5000.0  # of the 16-bit depth images, as in the original sets
 
 
 def write_tum(items: Iterable[Item], folder: Path) -> int:
-    """Writes rgb.txt, depth.txt, groundtruth.txt, camera.txt and the images; returns how many frames.
+    """Writes the images, camera.txt, groundtruth.txt, depth.txt and, last, rgb.txt; returns how many frames.
 
-    Raises FileExistsError if the folder has a sequence already, ValueError where depth does not fit into 16 bits
-    (more than 13.1 units) or is too small for their step of 0.2 thousandths.
+    Raises FileExistsError if the folder has a sequence already, OSError where it cannot be written, ValueError where
+    depth does not fit into 16 bits (more than 13.1 units) or is too small for their step of 0.2 thousandths.
     """
     if (folder / "rgb.txt").exists():
         raise FileExistsError(f"{folder} has a sequence already: give another folder or remove it")
     for name in ("rgb", "depth"):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    lists: dict[str, list[str]] = {"rgb": ["# color images"], "depth": ["# depth images"], "groundtruth": []}
-    lists["groundtruth"].append("# timestamp tx ty tz qx qy qz qw, camera to world")
+    lists = {
+        "groundtruth": ["# timestamp tx ty tz qx qy qz qw, camera to world"],
+        "depth": ["# depth images"],
+        "rgb": ["# color images"],  # last: where it is, all is
+    }
     count = 0
     for item in items:
         if item.depth is None or item.world_from_cam is None:
@@ -46,9 +51,9 @@ def write_tum(items: Iterable[Item], folder: Path) -> int:
                 "lie between about 0.1 and 13 (scene=aerial: scale=0.05)"
             )
         stamp = f"{item.timestamp:.6f}"
-        cv2.imwrite(str(folder / "rgb" / f"{stamp}.png"), item.image[:, :, ::-1])
+        _write_png(folder / "rgb" / f"{stamp}.png", item.image[:, :, ::-1])
         steps = np.round(item.depth.astype(np.float64) * UNITS_PER_METER).astype(np.uint16)
-        cv2.imwrite(str(folder / "depth" / f"{stamp}.png"), steps)
+        _write_png(folder / "depth" / f"{stamp}.png", steps)
         w, x, y, z = quaternion_from_rotation(item.world_from_cam[:3, :3])
         position = " ".join(f"{v:.9g}" for v in item.world_from_cam[:3, 3])
         lists["rgb"].append(f"{stamp} rgb/{stamp}.png")
@@ -58,8 +63,14 @@ def write_tum(items: Iterable[Item], folder: Path) -> int:
             (folder / "camera.txt").write_text(" ".join(f"{v:.9g}" for v in item.intrinsics) + "\n")
         count += 1
     for name, lines in lists.items():
-        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
+        replace_text(folder / f"{name}.txt", "\n".join(lines) + "\n")
     return count
+
+
+def _write_png(file: Path, pixels: np.ndarray) -> None:
+    """Raises OSError. OpenCV writes no file itself: it does not say where the end of one finds no room on the disk."""
+    _, content = cv2.imencode(".png", pixels)
+    file.write_bytes(content.tobytes())
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -84,6 +95,10 @@ def main(arguments: list[str] | None = None) -> None:
         count = write_tum(sequence, given.folder)
     except (ValueError, FileExistsError) as error:
         parser.error(str(error))
+    except OSError as error:
+        sys.exit(
+            f"write_tum: {given.folder} is not whole: {error}; once it can be written, give the same command again"
+        )
     print(f"{count} frames in {given.folder}; read them with dataset=tum dataset.path={given.folder}")
 
 

@@ -26,7 +26,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
-from tests.support.bag_messages import HEIGHT, WIDTH, Messages, picture, walk, write_walk
+from tests.support.bag_messages import HEIGHT, WIDTH, Messages, images_of, picture, walk, write_walk
 
 
 @pytest.fixture(params=[1, 2])
@@ -297,6 +297,15 @@ def test_a_calibration_that_cannot_be_is_refused(tmp_path: Path, ros: Messages) 
         open_dataset("bag", path=path)
 
 
+def damage(path: Path, number: int) -> None:
+    """Of a compressed bag of ROS 1 this chunk."""
+    with opened_bag(path) as bag:
+        chunk = list(bag.readers[0].chunks.values())[number]
+    content = bytearray(path.read_bytes())
+    content[chunk.datapos + 4 : chunk.datapos + 40] = bytes(36)
+    path.write_bytes(content)
+
+
 @pytest.mark.parametrize("compression", ["bz2", "lz4"])
 def test_behind_a_damaged_chunk_of_ros_1_the_rest_is_read(tmp_path: Path, compression: str) -> None:
     ros = Messages(1)
@@ -306,14 +315,28 @@ def test_behind_a_damaged_chunk_of_ros_1_the_rest_is_read(tmp_path: Path, compre
     writer.chunk_threshold = 1  # a chunk a message
     with writer:
         write_walk(ros, writer)
-    with opened_bag(path) as bag:
-        chunk = list(bag.readers[0].chunks.values())[3]
-    content = bytearray(path.read_bytes())
-    content[chunk.datapos + 4 : chunk.datapos + 40] = bytes(36)
-    path.write_bytes(content)
+    damage(path, 3)
     sequence = open_dataset("bag", path=path)
     assert [item.image[0, 0, 0] for item in sequence] == [20, 21, 23, 24, 25]
     assert any("parts of the bag left out because they are damaged: 1 (first: damaged" in w for w in sequence.warnings)
+
+
+@pytest.mark.parametrize("others", [True, False])
+def test_damage_before_the_first_calibration_is_counted_once(tmp_path: Path, others: bool) -> None:
+    ros, path = Messages(1), tmp_path / "walk.bag"
+    writer = Writer1(path)
+    writer.set_compression(Writer1.CompressionFormat.LZ4)
+    writer.chunk_threshold = 1  # a chunk a message
+    with writer:
+        infos = [("/c/camera_info", 1.0 + i, ros.info()) for i in range(2 if others else 1)]
+        ros.write_into(writer, [*infos, *images_of(ros)])
+    damage(path, 0)
+    sequence = open_dataset("bag", path=path)
+    assert len(list(sequence)) == 6
+    (told,) = [w for w in sequence.warnings if "damaged" in w]
+    assert "parts of the bag left out because they are damaged: 1 (first: damaged" in told
+    assert ("no calibration: /c/camera_info in the bag could not be read: " in told) != others
+    assert sequence.lens.guessed != others
 
 
 @pytest.mark.parametrize("mode", ["MESSAGE", "STORAGE"])

@@ -10,6 +10,7 @@ from PIL import Image
 
 from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets import open_dataset
+from mvsgs_core.datasets.files import UnreadableImageError, read_depth
 
 
 @pytest.mark.parametrize(("kind", "said"), [(np.int32, "32-bit integers"), (np.float32, "fractions")])
@@ -46,3 +47,23 @@ def test_of_12_bits_in_16_it_is_said_what_to_do(tmp_path: Path) -> None:
     assert not warnings(4095, 4096), "a dark picture among others"
     Image.fromarray(np.full((48, 64), 3, dtype=np.uint8)).save(tmp_path / "8.png")
     assert not open_dataset("images", path=tmp_path, start=8, intrinsics=[50, 51, 31, 24]).warnings, "8 bits"
+
+
+@pytest.mark.parametrize("maximum", [256, 4095, 10_000, 65_535])
+@pytest.mark.parametrize("plain", [False, True])
+def test_counts_of_depth_are_those_of_the_file_whatever_maximum_it_names(
+    tmp_path: Path, maximum: int, plain: bool
+) -> None:
+    counts = np.linspace(0, maximum, 12 * 16).astype(np.uint16).reshape(12, 16)
+    pixels = " ".join(map(str, counts.ravel())).encode() if plain else counts.astype(">u2").tobytes()
+    (tmp_path / "a.pgm").write_bytes(f"P{2 if plain else 5}\n16 12\n{maximum}\n".encode() + pixels)
+    depth = read_depth(tmp_path / "a.pgm", 1.0)
+    assert (depth == counts).all()
+
+
+@pytest.mark.parametrize("kind", [2, 5])
+def test_depth_of_a_maximum_of_8_bits_is_refused(tmp_path: Path, kind: int) -> None:
+    pixels = b"7 8 " * 96 if kind == 2 else bytes(192)
+    (tmp_path / "a.pgm").write_bytes(f"P{kind}\n16 12\n100\n".encode() + pixels)
+    with pytest.raises(UnreadableImageError, match="this one has 8 bits"):
+        read_depth(tmp_path / "a.pgm", 1000.0)

@@ -167,3 +167,17 @@ def test_a_lossy_mask_is_black_where_it_is_nearly(tmp_path: Path) -> None:
         CameraMask(write_mask(tmp_path / "rim.png", (np.arange(WIDTH) < 2) & LEFT | (np.arange(WIDTH) < 2))).framed(
             Framing(crop=4), Lens((50.0, 50.0, 31.5, 23.5), (HEIGHT, WIDTH)), (HEIGHT - 8, WIDTH - 8)
         )
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("a.tif", np.float32([0, 0.2, 0.5, 1])),
+        ("a.png", np.uint8([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 4]])),
+        ("a.png", np.uint8([[0, 255], [1, 255], [2, 255], [4, 255]])),  # with an alpha channel
+        ("a.png", np.uint16([0, 1, 200, 65535])),
+    ],
+)
+def test_all_but_0_counts_however_small(tmp_path: Path, name: str, values: np.ndarray) -> None:
+    Image.fromarray(values[None]).save(tmp_path / name)
+    assert read_mask(tmp_path / name).tolist() == [[False, True, True, True]]

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFile
 
 from mvsgs_core.datasets import Item, open_dataset
-from mvsgs_core.datasets.exif import read_exif_lens, read_exif_time
+from mvsgs_core.datasets.exif import read_exif_exposure, read_exif_lens, read_exif_place, read_exif_time
+from mvsgs_core.datasets.files import opened_image, upright_size
 from tests.support.dataset_folders import write_image, write_photos
 
 EQUIVALENT, FOCAL, RESOLUTION, UNIT, WIDTH, HEIGHT = 0xA405, 0x920A, 0xA20E, 0xA210, 0xA002, 0xA003
@@ -237,6 +238,61 @@ def test_times_of_photographs(tmp_path: Path) -> None:
     for wrong in ("0000:00:00 00:00:00", "    :  :     :  :  ", "yesterday"):
         assert read_exif_time(photograph(tmp_path / "a.jpg", {TAKEN: wrong})) is None
     assert read_exif_time(photograph(tmp_path / "a.jpg")) is None
+
+
+def chunks_of(png: bytes) -> list[bytes]:
+    found, at = [], 8
+    while at < len(png):
+        end = at + 12 + int.from_bytes(png[at : at + 4])
+        found.append(png[at:end])
+        at = end
+    return found
+
+
+@pytest.mark.parametrize("after", [False, True])
+def test_the_header_of_a_png_is_read_without_its_pixels(after: bool, tmp_path: Path) -> None:
+    """It may come after them. They are damaged here, so that decoding them would fail."""
+    path = tmp_path / "a.png"
+    header = Image.Exif()
+    header[0x0112] = 6
+    header.get_ifd(0x8769).update({EQUIVALENT: 26, TAKEN: "2026:05:01 14:00:02", 0x829A: 0.5, 0x829D: 2.0, 0x8827: 80})
+    header.get_ifd(0x8825).update({1: "N", 2: (47.0, 0.0, 0.0), 3: "E", 4: (8.0, 0.0, 0.0)})
+    Image.fromarray(np.zeros((48, 64, 3), np.uint8)).save(path, exif=header)
+    content = path.read_bytes()
+    chunks = {chunk[4:8]: chunk for chunk in chunks_of(content)}
+    pixels = chunks[b"IDAT"][:8] + bytes(len(chunks[b"IDAT"]) - 8)
+    order = [pixels, chunks[b"eXIf"]] if after else [chunks[b"eXIf"], pixels]
+    path.write_bytes(content[:8] + b"".join([chunks[b"IHDR"], *order, chunks[b"IEND"]]))
+    lens, taken, place = read_exif_lens(path), read_exif_time(path), read_exif_place(path)
+    assert lens is not None
+    np.testing.assert_allclose(lens.intrinsics[0], 26 * 80 / np.hypot(36, 24))
+    assert lens.size == (64, 48)
+    assert taken is not None
+    assert taken.isoformat() == "2026-05-01T14:00:02"
+    assert read_exif_exposure(path) == 10.0
+    assert place is not None
+    assert place[:2].tolist() == [47, 8]
+    with opened_image(path, path.name) as opened:
+        assert upright_size(opened) == (64, 48)
+
+
+def test_a_folder_of_png_is_opened_without_decoding_it_and_each_frame_is_decoded_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_photos(tmp_path, 12)
+    decoded = list[str]()
+    load = ImageFile.ImageFile.load
+
+    def counted(image: ImageFile.ImageFile) -> object:
+        if image.tile:
+            decoded.append(str(image.filename))
+        return load(image)
+
+    monkeypatch.setattr(ImageFile.ImageFile, "load", counted)
+    sequence = open_dataset("images", path=tmp_path)
+    assert decoded == []
+    assert len(list(sequence)) == 12
+    assert len(decoded) == 12
 
 
 def track(folder: Path) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,11 @@ import pytest
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.datasets.by_time import nearest
 from mvsgs_core.datasets.tum import CAMERAS
+from mvsgs_core.datasets.write_tum import main
 from mvsgs_core.geometry import quaternion_from_rotation, so3_exp
 from mvsgs_core.trajectory_file import read_trajectory
 from tests.support.dataset_folders import pose, truncate, write_image, write_tum
+from tests.support.full_disk import full_after
 
 
 def test_frames_poses_and_depth_are_associated(tmp_path: Path) -> None:
@@ -231,3 +234,21 @@ def test_intrinsics_of_images_of_another_size_are_told_of(tmp_path: Path) -> Non
     cropped = open_dataset("tum", path=folder, intrinsics=[60, 61, -5, 24])
     assert any("lies at the border" in w and "about" not in w for w in cropped.warnings)
     assert not any("border" in w for w in open_dataset("tum", path=folder, intrinsics=[60, 61, 50, 24]).warnings)
+
+
+@pytest.mark.parametrize("what", ["rgb/0.000000.png", "groundtruth.txt"])
+def test_a_recording_that_finds_no_room_on_the_disk_is_said_not_to_be_whole(tmp_path: Path, what: str) -> None:
+    """Also where it is the last byte of a file that finds none. Once there is room, the same command writes it."""
+    folder = tmp_path / "walk"
+    size, frames = ("48", "64"), "1"
+    if what == "groundtruth.txt":
+        size, frames = ("12", "12"), "20"
+    command = [str(folder), "--frames", frames, "--size", *size]
+    main(command)
+    room = (folder / what).stat().st_size - 1
+    assert max(path.stat().st_size for path in folder.rglob("*") if path.is_file()) == room + 1
+    shutil.rmtree(folder)
+    with full_after(room), pytest.raises(SystemExit, match=f"^write_tum: {folder} is not whole: .*File too large"):
+        main(command)
+    main(command)
+    assert len(list(open_dataset("tum", path=folder))) == int(frames)
