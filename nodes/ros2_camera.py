@@ -20,6 +20,7 @@ from mvsgs_core.export.source_camera import LENS, lens_values
 from nodes.live import LiveSource, camera_mask
 from nodes.ros2.cdr import CdrError
 from nodes.ros2.connection import LOOPBACK, SENSOR_DATA, Connection, check_installed
+from nodes.ros2.given_poses import GivenPoses
 from nodes.ros2.messages import CameraInfo, CompressedImage, Image
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 UNSTAMPED = 1.0  # s for which images without a time stamp are left out: a simulation may have no clock yet
 POLL = 0.1  # s at most between two looks at the clock and at what was lost
+POSED = 0.01  # s at most between two looks at /tf, while an image waits for its pose
 
 
 class Ros2Camera(LiveSource):
@@ -49,6 +51,9 @@ class Ros2Camera(LiveSource):
         # lost images are sent again, for which the sender must be reliable too; null: once some were lost, if it is
         reliable: bool | None = None
         queue: int = SENSOR_DATA.depth  # images that may wait; of these the newest is taken
+        # odom, map: frames come with the camera's pose in this frame of /tf, of the robot's own odometry; null: without
+        fixed_frame: str | None = None
+        camera_frame: str | None = None  # the camera's in /tf, x right, y down, z forward; null: as its images name it
 
         def __post_init__(self) -> None:
             LiveSource.Config.__post_init__(self)
@@ -72,6 +77,7 @@ class Ros2Camera(LiveSource):
         self._warned_of_lens = False
         self._uncalibrated_since: float | None = None  # the first image without
         self._met = False  # somebody who publishes them
+        self._camera_frame = ""  # as the last image named it
         # by time.monotonic, when images without a time stamp get the time here; None: none came, inf: others have one
         self._unstamped_until: float | None = None
 
@@ -88,6 +94,8 @@ class Ros2Camera(LiveSource):
 
         self._participant = Participant(self.config)
         self._read(reliable=bool(self.config.reliable))
+        world = self.config.fixed_frame
+        self._given = None if world is None else GivenPoses(self._participant, world, self.stats)
 
     def _read(self, reliable: bool) -> None:
         c = self.config
@@ -101,25 +109,30 @@ class Ros2Camera(LiveSource):
         self._infos = self._participant.reader(self._info_topic, CameraInfo, SENSOR_DATA)
 
     def _close(self) -> None:
-        del self._images, self._infos, self._participant
+        del self._images, self._infos, self._given, self._participant
 
     @property
     def _silence(self) -> str:
         return f"no usable image at {self._topic}"
 
     def _next(self, seconds: float) -> Frame | None:
-        self._images.wait(min(POLL, seconds))
+        self._images.wait(min(POSED if self._given is not None and self._given.waits else POLL, seconds))
         waiting = self._images.take()
         self._met = self._met or self._images.writers > 0
         self._note_losses()
         if not waiting:
             if self._frames.native is not None and not self._images.writers:
                 self._presence.lost("nobody publishes its images any more")
-            return None
+            return None if self._given is None else self._given.take()
         self._presence.came()
         self.stats.count("dropped", len(waiting) - 1)
         with self.stats.time("image"):
-            return self._frame(waiting[-1])
+            frame = self._frame(waiting[-1])
+        if self._given is None:
+            return frame
+        if frame is not None:
+            self._given.add(frame, self.config.camera_frame or self._camera_frame)
+        return self._given.take()
 
     def _note_losses(self) -> None:
         """Of datagrams: a best-effort image of which one is lost never comes, and nothing else tells of it."""
@@ -178,6 +191,7 @@ class Ros2Camera(LiveSource):
         stamp = self._stamp(message.header.stamp.nanoseconds)
         if stamp is None:
             return None
+        self._camera_frame = message.header.frame_id
         intrinsics = np.array(lens.at(native).intrinsics)
         return Frame(0, stamp / 10**9, image, intrinsics, lens.guessed, stamp=stamp)
 

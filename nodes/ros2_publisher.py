@@ -6,13 +6,14 @@ import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
 from msgs import Asked, CameraPose, FusedKeyframe, Keyframe, Poses, Preview, Reply, Request
 from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.datasets.ros import camera_info_topic
+from mvsgs_core.geometry import scaled
 from nodes import Node
 from nodes.odometry import Odometry
 from nodes.ros2 import forms
@@ -77,6 +78,9 @@ class Ros2Publisher(Node):
         maps: str | None = None  # folder in which save_map, load_map and reset leave maps; null: OUTPUT/maps
         load: str | None = None  # the map of load_map, output of a run that kept it; null: the newest in `maps`
         unit: float = 1.0  # meters in one unit of the map, where you know it
+        # of the map: camera: the first keyframe's, which are turned into ROS's; ros: those already, as of poses that
+        # were given in one of ROS's frames, by dataset.fixed_frame with tracker=ground_truth
+        axes: Literal["camera", "ros"] = "camera"
         reliable: bool = True  # pose, path and depth; false: best effort, which readers that ask for more do not get
         queue: int = DEFAULT.depth  # messages of a topic that a slow reader may be behind
         max_points: int = 100000  # of the map; more are thinned evenly
@@ -99,6 +103,7 @@ class Ros2Publisher(Node):
         from nodes.ros2.dds import Participant
 
         c, topics = self.config, self.config.topics
+        self._turn = forms.BODY_FROM_OPTICAL if c.axes == "camera" else np.eye(4)
         self._participant = Participant(c)
         live = Quality(c.reliable, c.queue)
         self._pose = self._writer(topics.pose, PoseStamped, live)
@@ -231,10 +236,10 @@ class Ros2Publisher(Node):
         """Its transforms, and its pose if it is the newest: of an earlier frame nobody asks where the camera is."""
         frames, unit = self.config.frames, self.config.unit
         world, stamp = self._map(segment), _stamp(message)
-        map_from_odom = forms.body_pose(self._odometry.map_from_odom, unit)
+        map_from_odom = self._turn @ scaled(self._odometry.map_from_odom, unit) @ self._turn.T
         transforms = [
             forms.transform(stamp, world, frames.odom, map_from_odom),
-            forms.transform(stamp, frames.odom, frames.camera, forms.body_pose(odom_from_cam, unit)),
+            forms.transform(stamp, frames.odom, frames.camera, self._posed(odom_from_cam)),
         ]
         self._write(self._tf, TFMessage(transforms))
         self._sent[message.index] = None
@@ -263,7 +268,7 @@ class Ros2Publisher(Node):
         seen = seen[:: max(1, -(-len(seen) // c.max_points))]
         means = preview.means[seen].astype(np.float64)
         world = means if preview.origin is None else means + preview.origin
-        points = c.unit * world @ forms.BODY_FROM_OPTICAL[:3, :3].T
+        points = c.unit * world @ self._turn[:3, :3].T
         return forms.point_cloud(self._at_map(segment), points, preview.colors[seen])
 
     def _at_map(self, segment: int) -> Header:
@@ -271,8 +276,12 @@ class Ros2Publisher(Node):
 
     def _stamped(self, stamps: list[Time], world: str, world_from_cam: np.ndarray) -> list[PoseStamped]:
         """Of poses (N, 4, 4)."""
-        poses = forms.poses(forms.body_pose(world_from_cam, self.config.unit))
+        poses = forms.poses(self._posed(world_from_cam))
         return [PoseStamped(forms.header(t, world), pose) for t, pose in zip(stamps, poses, strict=True)]
+
+    def _posed(self, world_from_cam: np.ndarray) -> np.ndarray:
+        """Poses (..., 4, 4) with ROS's axes, in meters."""
+        return forms.body_pose(world_from_cam, self.config.unit, self._turn)
 
     def _static_transform(self) -> TFMessage:
         frames = self.config.frames

@@ -30,9 +30,12 @@ POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
 _FIELDS = [PointField(name, 4 * i, PointField.FLOAT32, 1) for i, name in enumerate(("x", "y", "z", "rgb"))]
 
 
-def body_pose(world_from_cam: np.ndarray, unit: float) -> np.ndarray:
-    """Poses (..., 4, 4) between two frames with our axes -> between the same with ROS's; `unit` is meters in one."""
-    turned = BODY_FROM_OPTICAL @ world_from_cam @ BODY_FROM_OPTICAL.T
+def body_pose(world_from_cam: np.ndarray, unit: float, turn: np.ndarray = BODY_FROM_OPTICAL) -> np.ndarray:
+    """Poses (..., 4, 4) between two frames with our axes -> between the same with ROS's; `unit` is meters in one.
+
+    turn: of the world's axes to ROS's; the identity where they are.
+    """
+    turned = turn @ world_from_cam @ BODY_FROM_OPTICAL.T
     turned[..., :3, 3] *= unit
     return np.asarray(turned)
 

@@ -134,6 +134,20 @@ def test_the_pose_is_in_the_axes_of_ros(peer: Peer) -> None:
     assert matrix(optical["transform"])[:3, 0] == pytest.approx([0, -1, 0])  # its x to the right
 
 
+def test_a_map_of_poses_that_were_given_in_ros_stays_where_it_is(peer: Peer) -> None:
+    graph = Graph(peer, axes="ros")
+    upright = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # the axes of a camera that looks along x
+    send(graph.node.on_camera_pose(seen(0, geometry.rigid(upright, np.array([3.0, -1.0, -2.0])), None)))
+    (message,) = graph.taken("pose")
+    np.testing.assert_allclose(matrix(message["pose"]), geometry.rigid(np.eye(3), np.array([3.0, -1, -2])), atol=1e-9)
+    map_from_odom, odom_from_camera = chain(graph.taken("tf")[0])
+    np.testing.assert_allclose(map_from_odom @ odom_from_camera, matrix(message["pose"]), atol=1e-9)
+    send(graph.node.on_preview(preview(np.array([[1.0, 2.0, 3.0]]), np.ones(1))))
+    (cloud,) = graph.taken("points")
+    found = np.frombuffer(bytes(cloud["data"]), "<f4").reshape(-1, 4)
+    np.testing.assert_allclose(found[0, :3], [1.0, 2.0, 13.0])
+
+
 def chain(message: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     map_odom, odom_camera = message["transforms"]
     assert (map_odom["header"]["frame_id"], map_odom["child_frame_id"]) == ("map", "odom")
