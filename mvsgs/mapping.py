@@ -43,7 +43,7 @@ from mvsgs.gaussian_map import CAMERAS, GaussianMap, View
 from mvsgs.saving import images_before, save_map
 from mvsgs_core.datasets.framing import Size
 from mvsgs_core.export.source_camera import LENS, lens_values, source_camera
-from mvsgs_core.kept_map import check_kept_map, tracker_file
+from mvsgs_core.kept_map import check_kept_map
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.results import cameras_of
 from mvsgs_core.mapping.losses import LossFunction, name_of
@@ -244,7 +244,8 @@ class Mapping:
         """Writes the map as it is now: map.ply, cameras.json and trajectory.txt, for `mvsgs view`, `export`, `render`,
         and what `Mapping.load` goes on with and `mvsgs info` shows (not where poses were given).
 
-        images: each keyframe's image, too; `warnings` says how many could not be. An earlier save there is replaced.
+        images: each keyframe's image, too; `warnings` says how many could not be. An earlier save there is replaced;
+        where that fails, `Mapping.load` goes on with the earlier one or with this one.
         Raises OSError; ValueError for the output of a run, for a folder where files of others would be replaced, and
         for the root of the file system and the home folder themselves; RuntimeError where there is no map yet, or
         nothing new since it was loaded.
@@ -257,14 +258,13 @@ class Mapping:
             if isinstance(node, Tracker) and not node.core.mapped:
                 raise RuntimeError("no frame has come since the map was loaded: there is nothing new to save")
             source, track = source_camera(self.statistics), self._trajectory and self.trajectory
-            if left_out := save_map(path, self._atlas, source, track, images, self._came):
+            keep_tracker = node.core.keep_map if isinstance(node, Tracker) else None
+            if left_out := save_map(path, self._atlas, source, track, images, self._came, keep_tracker):
                 self._mapper.stats.warn(
                     f"{left_out} of {len(self._atlas.largest.views)} keyframes were saved without an image: it was let "
                     "go (mapper.max_keyframes), found no room on the disk, or is of a stream before that was saved "
                     "without images, and smaller (mapper.max_pixels) or as its rolling shutter took it"
                 )
-            if isinstance(node, Tracker):
-                node.core.keep_map(tracker_file(path))
             return path
 
     def export(self, path: str | Path, **options: Any) -> Path:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
 from torch import Tensor, from_numpy
 
-from mvsgs_core.atomic_file import replacing
+from mvsgs_core.atomic_file import replacing, sync_to_disk
 from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.cameras import read_cameras, write_cameras
 from mvsgs_core.export.source_camera import SourceCamera
-from mvsgs_core.kept_map import FOLDER, STREAM, tracker_file
+from mvsgs_core.kept_map import FOLDER, STREAM, TRACKER, tracker_file
 from mvsgs_core.mapping.atlas import Atlas
+from mvsgs_core.mapping.checkpoints.files import state_files
 from mvsgs_core.mapping.checkpoints.results import cameras_of, write_results
 from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.mapping.keyframes import TrainingView
@@ -28,14 +29,15 @@ RESULTS = ("map.ply", CAMERAS, TRANSFORMS, "trajectory.txt", keyframe_images.FOL
 
 def save_map(
     folder: Path, atlas: Atlas, source: SourceCamera | None, trajectory: Trajectory | None, images: bool,
-    came: Mapping[int, Tensor] | None = None,
+    came: Mapping[int, Tensor] | None = None, keep_tracker: Callable[[Path], object] | None = None,
 ) -> int:  # fmt: skip
-    """The mapper's half of a kept map, and beside it what others read. An earlier map there is replaced, and nothing
-    that anybody else has left.
+    """A kept map, and beside it what others read. An earlier map there is replaced, and nothing that anybody else has
+    left; whatever is raised, the earlier one can be gone on with, or this one.
 
     source: the camera that took the stream. trajectory: of all frames, of which those in the map's
     part of the stream are written; None: that of the keyframes is. images: the keyframes', too. came: of keyframes that
-    are trained on another image than the one that came, the latter (H, W, 3) uint8, by index.
+    are trained on another image than the one that came, the latter (H, W, 3) uint8, by index. keep_tracker: writes the
+    tracker's half of the map to a file; None: there is none.
     Returns how many keyframes have no image that could be written. Raises OSError; ValueError for a folder with the
     report of a run, which would be another map's then, or with files of others that would be replaced, and for the
     root of the file system and the home folder.
@@ -49,8 +51,7 @@ def save_map(
     shown = atlas.largest
     if earlier is None:  # first of all, so that what is cut off is known as a save
         write_cameras(folder / CAMERAS, cameras_of(shown.snapshot(), shown.views), source)
-    tracker_file(folder).unlink(missing_ok=True)  # of the map before: no half of this one
-    CheckpointWriter(folder, shown.config).write(atlas.frozen())
+    _write_halves(folder, atlas, keep_tracker)
     written = _write_images(folder, shown.views if images else [], came or {})
     _remove_images(folder, set(earlier or []) - written)
     write_results(folder, shown, source=source)
@@ -61,6 +62,30 @@ def save_map(
             mapped = trajectory.main([view.index for view in shown.views])
             write_trajectory(aside, trajectory.timestamp[mapped], trajectory.world_from_cam[mapped])
     return len(shown.views) - len(written) if images else 0
+
+
+def _write_halves(folder: Path, atlas: Atlas, keep_tracker: Callable[[Path], object] | None) -> None:
+    """The mapper's half beside that of the save before, which goes last. The tracker's is made first, as it needs room,
+    and put in its place then, which needs none; until then the save before is the one that is there."""
+    writer, before, half = CheckpointWriter(folder, atlas.largest.config), state_files(folder), tracker_file(folder)
+    aside = half.with_name(f".{TRACKER}")
+    last = half if keep_tracker is None else aside  # is there until the tracker's half is this map's, too
+    try:
+        if keep_tracker is not None:
+            keep_tracker(aside)
+        writer.write(atlas.frozen())
+        if keep_tracker is None:
+            half.unlink(missing_ok=True)
+        else:
+            aside.replace(half)
+    except BaseException:
+        if last.exists():
+            for file in set(state_files(folder)) - set(before):
+                file.unlink()
+        aside.unlink(missing_ok=True)
+        raise
+    sync_to_disk(half.parent)
+    writer.keep_newest()
 
 
 def images_before(folder: Path, atlas: Atlas) -> dict[int, Tensor]:

@@ -19,13 +19,13 @@ def replacing(file: Path, *, sync: bool = True) -> Iterator[Path]:
     try:
         yield aside
         if sync:
-            _sync(aside)
+            sync_to_disk(aside)
         aside.replace(file)
     except BaseException:
         aside.unlink(missing_ok=True)
         raise
     if sync:
-        _sync(file.parent)  # the new name too outlives a loss of power
+        sync_to_disk(file.parent)  # the new name too outlives a loss of power
 
 
 def parts_of(file: Path) -> list[Path]:
@@ -40,7 +40,8 @@ def replace_text(file: Path, text: str) -> None:
         aside.write_text(text, encoding="utf-8")
 
 
-def _sync(path: Path) -> None:
+def sync_to_disk(path: Path) -> None:
+    """Waits until a file, or the names in a folder, outlive a loss of power. Raises OSError."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -164,6 +164,7 @@ class Evaluator(Node):
         }
         said = statistics.collected({**self.upstream, "evaluator": own})
         self.report["time"] |= said.pop("time")
+        self.report["notes"] += said.pop("notes", [])
         self.report |= said
         self.report |= {
             "finished": True,

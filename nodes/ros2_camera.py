@@ -20,8 +20,8 @@ from mvsgs_core.export.source_camera import LENS, lens_values
 from nodes.live import LiveSource, camera_mask
 from nodes.ros2.cdr import CdrError
 from nodes.ros2.connection import LOOPBACK, SENSOR_DATA, Connection, check_installed
-from nodes.ros2.given_poses import GivenPoses
 from nodes.ros2.messages import CameraInfo, CompressedImage, Image
+from nodes.ros2_given_poses import GivenPoses
 
 if TYPE_CHECKING:
     from nodes.ros2.dds import Reader

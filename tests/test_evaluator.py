@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from launch.summary import summary
 from msgs import GroundTruth, Trajectory
 from mvsgs_core.camera import resampled
 from mvsgs_core.datasets.lens import Lens, Undistortion
@@ -62,6 +63,21 @@ def test_report(evaluator: Evaluator) -> None:
     assert report["skipped"] == {"tracker": {"frames": 2}}
     assert report["warnings"]["tracker"] == ["w"]
     assert evaluator.stats.counts["frames_scored"] == 2 * N + after["held_out_fitted"]["count"], "a user waits for them"
+
+
+def test_what_a_resumed_run_took_is_not_known_and_said(evaluator: Evaluator) -> None:
+    """Its keyframes are those of all its parts, and its clock is that of the last one."""
+    report = feed(evaluator, upstream={"mapper": {"seconds": {"optimization": 8.0}, "values": {"resumed": "a state"}}})
+    assert report["time"]["wall"] is report["time"]["keyframes_per_second"] is None
+    assert report["time"]["stages"]["mapper"] == {"optimization": 8.0}
+    (note,) = [note for note in report["notes"] if "resumed" in note and "depth" not in note]
+    assert note.startswith("the run was resumed: how long it took is not known")
+    assert note in evaluator.stats.warnings
+    assert evaluator.folder is not None
+    html = (evaluator.folder / "report.html").read_text()
+    for name in ("wall time, first frame to finished map", "keyframes per second"):
+        assert f"<tr><td>{name}</td><td>–</td></tr>" in html
+    assert not any(line.startswith("time") for line in summary(evaluator.folder).splitlines())
 
 
 def test_files(evaluator: Evaluator) -> None:

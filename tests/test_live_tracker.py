@@ -11,9 +11,10 @@ import pytest
 
 import msgs
 from msgs import CameraPose, Frame, Keyframe, TrackedFrame, TrackerPhase, Trajectory
+from mvsgs_core import geometry
 from mvsgs_core.tracking.phase import Phase
 from mvsgs_core.tracking.publish import Update
-from mvsgs_core.tracking.steps import whole
+from mvsgs_core.tracking.steps import Steps, whole
 from mvsgs_core.tracking.tracker import Tracker as CoreTracker
 from mvsgs_core.trajectory import TrackingState
 from nodes.tracker import Tracker
@@ -128,6 +129,72 @@ def test_a_frame_that_went_as_far_while_a_keyframe_was_worked_on_is_one_at_once(
     again = whole(after.rest)
     assert again.keyframes == (frame.index,)
     assert again.rest is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("at_the_end", [False, True])
+def test_a_frame_that_came_before_a_loop_is_a_keyframe_where_the_map_is_after_it(
+    at_the_end: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What comes while a keyframe is tied to the map is followed from it, in the world as it was then."""
+    core, coming = CoreTracker(), iter(frames(80))
+    for frame in coming:
+        update = followed(core, frame)
+        if update.rest is not None and frame.index > 30 and core.phase is Phase.TRACKING:
+            break
+        update.whole()
+    assert update.rest is not None
+    first, session = frame.index, core.session
+    while session.front_end.reference is None or session.front_end.reference.index < first:
+        next(update.rest)
+    for _ in range(4):
+        frame = next(coming)
+        assert followed(core, frame).rest is None
+    joined = geometry.se3_exp(np.array([4.0, -3.0, 2.0, 0.3, 1.0, -0.5]))
+
+    def joining(index: int) -> Steps[None]:
+        for keyframe in session.graph.keyframes.values():
+            keyframe.cam_from_world = keyframe.cam_from_world @ joined
+        session.graph.rescale(list(session.graph.keyframes), 3.0)
+        yield
+
+    monkeypatch.setattr(session.keyframe_work, "_close_loops", joining)
+    monkeypatch.setattr(session.choice, "is_late", lambda *_: not at_the_end)
+    update = whole(update.rest)
+    monkeypatch.undo()
+    assert (update.rest is None) == at_the_end
+    if update.rest is None:
+        list(core.finish())
+    else:
+        assert whole(update.rest).state is TrackingState.TRACKED
+    assert core.stats.counts.get("keyframes taken back", 0) == 0
+    keyframes = sorted(session.graph.keyframes)
+    assert keyframes[-1] > first
+    found = np.stack([session.graph.world_from_cam(n)[:3, 3] for n in keyframes])
+    true = np.stack([np.asarray(synthetic(frames=80)[n].world_from_cam)[:3, 3] for n in keyframes])
+    assert np.abs(geometry.umeyama(found, true).apply(found) - true).max() < 0.01
+
+
+@pytest.mark.slow
+def test_every_keyframe_is_sent_where_the_stream_ends_with_two(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last frame is held out, and so far from the one before, which becomes a keyframe, that it is one as well."""
+    given = frames(80)
+    made = CoreTracker()
+    for frame in given[:39]:
+        followed(made, frame).whole()
+    monkeypatch.setattr("mvsgs_core.tracking.keyframe_choice.LAST", 0.0)
+    monkeypatch.setattr("mvsgs_core.tracking.keyframe_choice.is_held_out", lambda index: index == 40)
+    monkeypatch.setattr(made.session.choice, "wants", lambda *_: False)
+    for frame in (given[39], given[40]):
+        followed(made, frame).whole()
+    assert {39, 40} <= made.session._tail.indices
+    before = set(made.session.publisher.published)
+    monkeypatch.setattr(made.session.choice, "is_late", lambda *_: True)
+    updates = list(made.finish())
+    sent = [index for update in updates for index in update.keyframes]
+    assert sent == [39, 40]
+    assert set(sent) == made.session.publisher.published - before
+    assert all(update.rest is None for update in updates)
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import threading
 import time
@@ -40,7 +41,8 @@ def tracker_half(folder: Path) -> Path:
 
 
 def asked_on_a_full_disk(node: Mapper, request: Request) -> Reply:
-    with full_after(5_000):
+    with full_after(5_000), pytest.MonkeyPatch.context() as patched:  # which says that the file is too large
+        patched.setattr("mvsgs_core.mapping.checkpoints.writer.FULL", (errno.EFBIG,))
         replies: list[Reply] = [m for m in node.on_request(request) if isinstance(m, Reply)]
         replies += list(node._saved.replies(wait=True))
     (reply,) = replies

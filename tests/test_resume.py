@@ -104,6 +104,7 @@ def test_with_the_rest_of_the_stream_it_gives_the_same_map_to_the_bit(
         np.testing.assert_array_equal(getattr(final, name), getattr(whole, name), err_msg=name)
     report = json.loads((output / "report.json").read_text())
     assert report["counts"]["mapper"]["views"] == len(whole.keyframes)
+    assert report["time"]["wall"] is report["time"]["keyframes_per_second"] is None, "of all its parts"
     of = len(whole.keyframes) - len(info.keyframes) + 12, len(whole.keyframes)
     assert any(note.startswith(f"depth is scored of {of[0]} of {of[1]} keyframes") for note in report["notes"])
 

@@ -102,3 +102,22 @@ def test_the_map_that_is_gone_on_with_is_not_exported_over(tmp_path: Path) -> No
                 export(saved / name)
     assert {name: (saved / name).read_bytes() for name in before} == before
     assert again.export(tmp_path / "map.ply").exists()
+
+
+@pytest.mark.parametrize("step", ["writer.save", "results.write_ply"])
+def test_a_map_whose_second_save_finds_no_room_is_gone_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    mapping = tracked()
+    saved = mapping.save(tmp_path / "saved")
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(f"mvsgs_core.mapping.checkpoints.{step}", full)
+    with pytest.raises(OSError, match="No space left"):
+        mapping.save(saved)
+    monkeypatch.undo()
+    with Mapping.load(saved, *SMALL, intrinsics=room()[0].intrinsics) as again:
+        found = again.add(room()[3].image, 0.0)
+    assert found.world_from_cam is not None

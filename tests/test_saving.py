@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pkgutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +21,20 @@ from mvsgs_core.shared_folder import ROOT, shared
 from mvsgs_core.stats import Stats
 from mvsgs_core.trajectory import Trajectory
 from tests.support.small_atlas import PLAIN, SIZE, begun, written
+from tests.support.small_atlas import view as keyframe
 
 
 @pytest.fixture(scope="module")
 def atlas() -> Atlas:
     return begun(PLAIN)
+
+
+@pytest.fixture(scope="module")
+def larger() -> Atlas:
+    """By a keyframe."""
+    found = begun(PLAIN)
+    found.add(keyframe(6), 0)
+    return found
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -134,6 +145,58 @@ def test_a_map_without_a_tracker_s_half_takes_away_that_of_the_save_before(atlas
     save_map(tmp_path, atlas, None, None, images=False)
     with pytest.raises(ValueError, match="no map to begin on there"):
         check_kept_map(tmp_path)
+
+
+HALF = "the tracker's half"
+STEPS = (  # of a save, in the order in which they come
+    "mvsgs_core.mapping.checkpoints.writer.write_image", "mvsgs_core.mapping.checkpoints.checkpoint.write_state",
+    "mvsgs_core.mapping.checkpoints.writer.save", "mvsgs_core.mapping.checkpoints.writer.CheckpointWriter.keep_newest",
+    "mvsgs_core.export.keyframe_images.write_image", "mvsgs.saving.write_results",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=["full", "Ctrl-C"])
+@pytest.mark.parametrize("after", [False, True], ids=["instead", "after"])
+@pytest.mark.parametrize(
+    ("step", "tracked"), [*((step, False) for step in STEPS), *((step, True) for step in (*STEPS, HALF))]
+)
+def test_whatever_a_second_save_raises_the_first_or_the_second_is_there_whole(
+    atlas: Atlas, larger: Atlas, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tracked: bool, step: str, after: bool,
+    error: BaseException,
+) -> None:  # fmt: skip
+    """after: when the step has been made."""
+    half = tracker_file(tmp_path)
+    save_map(tmp_path, atlas, None, None, True, keep_tracker=lambda file: file.write_bytes(b"first"))
+
+    def keep(file: Path) -> None:
+        if step != HALF or after:
+            file.write_bytes(b"second")
+        if step == HALF:
+            raise error
+
+    def failing(made: Callable[..., object]) -> Callable[..., object]:
+        def found(*given: object, **named: object) -> None:
+            if after:
+                made(*given, **named)
+            raise error
+
+        return found
+
+    if step in STEPS:
+        monkeypatch.setattr(step, failing(pkgutil.resolve_name(step)))
+    with pytest.raises(type(error)):
+        save_map(tmp_path, larger, None, None, True, keep_tracker=keep if tracked else None)
+    monkeypatch.undo()
+    keyframes = len(begin_on(tmp_path, PLAIN, Stats()).largest.views)
+    if keyframes == len(atlas.largest.views):
+        assert half.read_bytes() == b"first"
+        assert step in (*STEPS[:3], HALF)
+    else:
+        assert keyframes == len(larger.largest.views)
+        assert (half.read_bytes() == b"second") if tracked else not half.exists()
+    assert not list(half.parent.glob(".*"))
+    save_map(tmp_path, larger, None, None, True)
+    assert len(list(half.parent.glob("state-*"))) == 1
 
 
 def test_what_was_exported_is_no_save(atlas: Atlas, tmp_path: Path) -> None:

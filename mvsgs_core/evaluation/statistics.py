@@ -13,22 +13,30 @@ from typing import Any
 
 def collected(stats: Mapping[str, Any]) -> dict[str, Any]:
     """Parts of the report, from the statistics of each node by name; "nothing" where a node had nothing to show,
-    "cut_off" where Ctrl-C ended a source's stream."""
+    "cut_off" where Ctrl-C ended a source's stream. Of a resumed run, "notes" and "time" say that nobody knows how long
+    it took."""
     nodes = {str(name): s for name, s in stats.items() if isinstance(s, Mapping)}
     cpu = {name: _number(s.get("cpu_seconds")) for name, s in nodes.items()}
     peak = {name: _number(s.get("peak_bytes")) for name, s in nodes.items()}
     reasons = {key: _said(nodes, key) for key in ("cut_off", "nothing")}
     latency = {name: waited for name, s in nodes.items() if (waited := _latencies(_mapping(s.get("values"))))}
+    resumed = ", ".join(_said(nodes, "resumed"))
+    note = (
+        "the run was resumed: how long it took is not known, nor its keyframes per second; seconds of its "
+        f"{resumed} are of all its parts, those of other stages of the last one"
+    )
     return {
         "time": {
             "stages": {name: _numbers(s.get("seconds")) for name, s in nodes.items()},
             "cpu": {name: seconds for name, seconds in cpu.items() if seconds is not None},
+            **({"wall": None, "keyframes_per_second": None} if resumed else {}),
         },
         "memory": {"peak_bytes": {name: size for name, size in peak.items() if size is not None}},
         "skipped": {name: found for name, s in nodes.items() if (found := _skipped(s))},
         "counts": {name: found for name, s in nodes.items() if (found := _numbers(s.get("counts")))},
         "warnings": {name: texts for name, s in nodes.items() if (texts := _texts(s.get("warnings")))},
         **({"latency": latency} if latency else {}),
+        **({"notes": [note]} if resumed else {}),
         **{key: by_node for key, by_node in reasons.items() if by_node},
     }
 

@@ -39,7 +39,7 @@ class Atlas:
     stream_ended: bool = False
     between: FramesBetween = field(default_factory=FramesBetween)  # frames that are no keyframes, on their way
     refined: int = 0  # iterations of the final refinement that are done
-    _in_blocks: Iterator[None] | None = None  # what is left of it where the map is refined in blocks
+    _in_blocks: Iterator[int] | None = None  # what is left of it in blocks, where the map is refined so
 
     @property
     def largest(self) -> OnlineMapper:
@@ -122,7 +122,8 @@ class Atlas:
     def refine(self) -> bool:
         """A piece of the final refinement, an iteration or a wait for one elsewhere; False when it is done.
 
-        In blocks the map stays as it is until all are done: who goes on from it begins the refinement anew.
+        In blocks the map stays as it is until all are done: who goes on from it begins the refinement anew. The last
+        iterations, over the whole map, follow as any others.
         """
         total = self.current.refinement
         if self.refined >= total:
@@ -132,8 +133,8 @@ class Atlas:
         if self._in_blocks is None:
             self.current.refine(self.refined, total)
             self.refined += 1
-        elif next(self._in_blocks, True):
-            self._in_blocks, self.refined = None, total
+        elif done := next(self._in_blocks):
+            self._in_blocks, self.refined = None, done
         return True
 
     def correct(

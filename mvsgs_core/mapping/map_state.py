@@ -70,13 +70,12 @@ class MapState:
             "steps": zeros.to(torch.int32) if steps is None else steps, "anchors": anchors.to(self.device),
             "means2d_gradient": zeros, "means2d_views": zeros,
         }  # fmt: skip
-        self._replace(lambda name, value: torch.cat([value, added[name]]))
+        self._grow(added)
 
     @torch.no_grad()
     def take_over(self, other: MapState) -> None:
         """Adds all splats of another map with their moments, ages, anchors and gradients; `other` stays as it is."""
-        added = other.tensors()
-        self._replace(lambda name, value: torch.cat([value, added[name]]))
+        self._grow(other.tensors())
 
     @torch.no_grad()
     def become(self, tensors: dict[str, Tensor]) -> None:
@@ -86,8 +85,9 @@ class MapState:
     @torch.no_grad()
     def keep(self, mask: Tensor) -> None:
         """Drops the splats where `mask` (N,) bool is False."""
-        if not bool(mask.all()):
-            self._replace(lambda _, value: value[mask])
+        count = int(mask.sum())
+        if count < len(mask):
+            self._replace(lambda _, value: value if len(value) == count else value[mask])
 
     @torch.no_grad()
     def accumulate_means2d(self, gradient: Tensor, visible: Tensor) -> None:
@@ -99,23 +99,39 @@ class MapState:
         self.means2d_gradient.zero_()
         self.means2d_views.zero_()
 
-    def _replace(self, change: Callable[[str, Tensor], Tensor]) -> None:
-        """Every one of `tensors()`, by name, becomes what `change` makes of it; one after the other, so that each is
-        freed when the new one takes its place: all at once would need the whole map's memory a second time."""
-        values = self._release_tensors()
-        for name in PARAMETERS:
-            values[name] = change(name, values[name])
-            self.first[name] = change(f"first/{name}", self.first[name])
-            self.second[name] = change(f"second/{name}", self.second[name])
-        self.splats = _leaves(values)
-        for name in SINGLE:
-            setattr(self, name, change(name, getattr(self, name)))
+    def _grow(self, added: dict[str, Tensor]) -> None:
+        before = len(self)
+        self._replace(lambda name, value: torch.cat([value, added[name]]), lambda _, value: value[:before])
 
-    def _release_tensors(self) -> dict[str, Tensor]:
-        """The splats' tensors, which nothing else holds then."""
-        values = {name: value.detach() for name, value in self.splats.tensors().items()}
-        self.splats = _leaves({name: value.new_zeros((0, *value.shape[1:])) for name, value in values.items()})
-        return values
+    def _replace(
+        self, change: Callable[[str, Tensor], Tensor], undo: Callable[[str, Tensor], Tensor] | None = None
+    ) -> None:
+        """Every one of `tensors()`, by name, becomes what `change` makes of it; one after the other, so that each is
+        freed when the new one takes its place: all at once would need the whole map's memory a second time.
+
+        What is raised on the way leaves them as they were, by `undo`, which may be given one that has not changed, or
+        without it as they are to be, by `change`, which may be given one that has. The largest come first: where memory
+        is short, nothing has changed yet.
+        """
+        sizes = {name: value.nbytes for name, value in self.tensors().items()}
+        names = sorted(sizes, key=lambda name: sizes[name], reverse=True)
+        try:
+            for name in names:
+                self._put(name, change(name, self.tensors()[name]))
+        except BaseException:
+            for name in names:
+                self._put(name, (undo or change)(name, self.tensors()[name]))
+            raise
+
+    def _put(self, name: str, value: Tensor) -> None:
+        """In place of the one of `tensors()` that has this name."""
+        moment, _, parameter = name.rpartition("/")
+        if moment:
+            getattr(self, moment)[parameter] = value
+        elif name in PARAMETERS:
+            setattr(self.splats, name, _leaf(value))
+        else:
+            setattr(self, name, value)
 
     def detached(self) -> Splats:
         """A view of the splats that no gradient reaches; shares memory."""
@@ -123,4 +139,8 @@ class MapState:
 
 
 def _leaves(values: dict[str, Tensor]) -> Splats:
-    return Splats(**{name: value.detach().contiguous().requires_grad_(True) for name, value in values.items()})
+    return Splats(**{name: _leaf(value) for name, value in values.items()})
+
+
+def _leaf(value: Tensor) -> Tensor:
+    return value.detach().contiguous().requires_grad_(True)

@@ -335,10 +335,7 @@ class OnlineMapper:
         self.keyframes.take_over(other.keyframes, change.scale)
         self.trainer.background = self.keyframes.background.color
         self.trainer.bound(self.keyframes.with_image, self.median_depth, larger)
-        self.schedule.reset()
-        self.schedule.add_budget(other.schedule.drop())
-        self.schedule.spared += other.schedule.spared
-        self.schedule.late += other.schedule.late
+        self.schedule.take_over(other.schedule)
         self.coarse.take_over(other.coarse)
         self.trainer.iterations += other.trainer.iterations
 

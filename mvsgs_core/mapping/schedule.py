@@ -32,6 +32,14 @@ class Schedule:
         self.beside = iterations
         self._local = []  # the window has moved
 
+    def take_over(self, other: Schedule) -> None:
+        """What another part is still to get, which has joined: its keyframes have got positions here."""
+        self.pending += other.drop()
+        self.beside = max(self.beside, other.beside)
+        self.spared += other.spared
+        self.late += other.late
+        self.reset()
+
     def drop(self) -> int:
         """Cancels the pending iterations; returns how many they were."""
         dropped, self.pending = self.pending, 0

@@ -21,7 +21,7 @@ def warn_of_gaps(stats: Stats, trajectory: Trajectory) -> None:
     )
     if lost:
         stats.warn(f"{lost} of {len(trajectory.state)} frames were lost")
-    if segments and unstarted:
+    if 0 < unstarted < len(trajectory.state):  # none at all started: that is the reason for no map
         stats.warn(f"{unstarted} of {len(trajectory.state)} frames came before a start and have no pose")
 
 

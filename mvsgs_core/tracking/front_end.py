@@ -9,9 +9,10 @@ from typing import Annotated
 import cv2
 import numpy as np
 
+from mvsgs_core import geometry
 from mvsgs_core.setting_ranges import UNBOUNDED, at_least, within
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
-from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.graph import KeyframeGraph, Solved
 from mvsgs_core.tracking.image import CELL, TrackingImage
 from mvsgs_core.tracking.matching.flow import DenseInverseSearch, Matches, propagate, sample_field
 from mvsgs_core.tracking.matching.matcher import Matcher
@@ -53,12 +54,23 @@ class Step:
     flow: float  # pixels, median since the reference
     still: bool  # nothing moved since the last frame: nothing was done
     localization: Localization | None  # None where no pose was asked for
+    then: Solved | None = None  # the reference when the pose was found against it
 
     @property
     def pose(self) -> np.ndarray:
         """(4, 4) cam_from_world, where one was asked for."""
         assert self.localization is not None
         return self.localization.cam_from_world
+
+    def pose_in(self, graph: KeyframeGraph) -> np.ndarray:
+        """The same in the map as it is: a pose moves with its reference, and is in its unit."""
+        now = graph.keyframes[self.reference]
+        if self.then is None or (self.then[0] is now.cam_from_world and self.then[1] is now.inverse_depth):
+            return self.pose
+        cam_from_world, inverse_depth = self.then[:2]
+        known = now.triangulated if now.triangulated.any() else np.ones(len(inverse_depth), bool)
+        unit = float(np.median((inverse_depth / now.inverse_depth)[known]))
+        return geometry.scaled(self.pose @ geometry.inverse(cam_from_world), unit) @ now.cam_from_world
 
 
 class FrontEnd:
@@ -130,11 +142,13 @@ class FrontEnd:
         if alive.any():
             flow = float(np.median(np.linalg.norm(matches.target[alive] - self.reference.cells.points[alive], axis=1)))
         found: Localization | None = None
+        then: Solved | None = None
         if with_pose:
+            then = self.graph.solved([self.reference.index])[self.reference.index]
             start = self.pose if self.pose is not None else self.graph.keyframes[self.reference.index].cam_from_world
             found = localize(self.graph, self.reference.index, matches, start, self.solver)
             guess, _ = self.graph.predict_pose(self.reference.index, found.cam_from_world)
-        step = Step(self.reference.index, matches, fraction, flow, False, found)
+        step = Step(self.reference.index, matches, fraction, flow, False, found, then)
         if self.is_lost(step):
             image.velocity, self.last.velocity = None, velocity
             self.last.__dict__.pop("cell_velocity", None)

@@ -25,8 +25,8 @@ MAX_OFFSET = 0.01  # of the image's width: by which a camera's rays may miss tho
 def go_on(session: Session, known: KnownMap, frames: tuple[int, int]) -> None:
     """Gives a session that has seen no frame the keyframes of a map. frames: their (height, width), as they come.
 
-    The map's intrinsics hold: those of the frames must be near them, unless they are a guess. Raises BadFileError for
-    another camera.
+    The map's intrinsics hold: those of the frames must be near them, but for a focal length that is a guess. Raises
+    BadFileError for another camera.
     """
     _check_camera(session, known, frames)
     graph = session.graph
@@ -41,7 +41,7 @@ def go_on(session: Session, known: KnownMap, frames: tuple[int, int]) -> None:
     for keyframe in known.keyframes:
         graph.add(keyframe)
     graph.edges |= known.edges
-    session.photometer.update()
+    session.photometer.take_up()
     for keyframe in known.keyframes:
         session.loops.add(keyframe.index)
         scale = known.scales.get(keyframe.index, 1.0)
@@ -51,6 +51,7 @@ def go_on(session: Session, known: KnownMap, frames: tuple[int, int]) -> None:
             session.records.append(record)
         keyframe.image.release()
     session.publisher.known_vignetting(known.published_vignetting)
+    session.publisher.behind = bool(known.scales)  # of this run: more may have been sent since it was saved
     session.covisible_keyframes.known(graph.keyframes)
     session.segment = known.keyframes[-1].segment
     session.phase = Phase.RELOCALIZING
@@ -66,19 +67,30 @@ def _check_camera(session: Session, known: KnownMap, frames: tuple[int, int]) ->
         )
     height, width = known.size
     corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
-    if session.calibration.guessed:
-        return
-    rays = (corners - session.intrinsics[2:]) / session.intrinsics[:2]
+    sent, guessed = session.intrinsics.copy(), session.calibration.guessed
+    if guessed:  # keyframes go out with the map's focal length, and with the rest of the guess
+        sent[:2] *= known.intrinsics[0] / sent[0]
+    rays = (corners - sent[2:]) / sent[:2]
     off = np.abs(rays * known.intrinsics[:2] + known.intrinsics[2:] - corners).max()
     if off > MAX_OFFSET * width:
-        its, theirs = (
-            np.round(scale_intrinsics(each, known.size, frames), 1).tolist()
-            for each in (known.intrinsics, session.intrinsics)
-        )
+        its, theirs = (scale_intrinsics(each, known.size, frames) for each in (known.intrinsics, sent))
+        whose, what = "these frames", "give frames of that camera, or its intrinsics,"
+        if guessed:
+            whose = "these frames, a guess but for that focal length,"
+            what = f"if it took them, too, give {_option(session, its, frames)},"
         raise BadFileError(
-            f"the map was made by another camera: at {frames[1]}x{frames[0]} pixels its intrinsics are {its}, those of "
-            f"these frames are {theirs}; give frames of that camera, or its intrinsics, or begin a map of their own"
+            f"the map was made by another camera: at {frames[1]}x{frames[0]} pixels its intrinsics are "
+            f"{np.round(its, 1).tolist()}, those of {whose} are {np.round(theirs, 1).tolist()}; {what} or begin a map "
+            "of their own"
         )
+
+
+def _option(session: Session, intrinsics: np.ndarray, frames: tuple[int, int]) -> str:
+    """For the next run: intrinsics (4,) at the size of the frames as those of the original images."""
+    original, came = session.calibration.original, scale_intrinsics(session.intrinsics, session.size, frames)
+    scale = original[:2] / came[:2]
+    (fx, fy), (cx, cy) = scale * intrinsics[:2], original[2:] + scale * (intrinsics[2:] - came[2:])
+    return f"dataset.intrinsics=[{fx:.1f},{fy:.1f},{cx:.1f},{cy:.1f}]"
 
 
 __all__ = ["go_on"]

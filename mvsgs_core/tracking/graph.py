@@ -222,4 +222,4 @@ class KeyframeGraph:
         return geometry.inverse(self.keyframes[index].cam_from_world)
 
 
-__all__ = ["Edge", "Keyframe", "KeyframeGraph"]
+__all__ = ["Edge", "Keyframe", "KeyframeGraph", "Solved"]

@@ -41,10 +41,11 @@ class KeyframeWork:
     def insert(self, frame: TrackingImage, step: Step, segment: int) -> Steps[bool]:
         """A frame becomes a keyframe that can be followed; False, and it is none, where the map contradicts its pose.
 
-        step: of the frame when it was followed.
+        step: of the frame when it was followed; its pose may be of a time before a loop.
         """
+        pose = step.pose_in(self.graph)
         matches, before = {step.reference: step.matches}, self.graph.solved(self.local_map.window(segment))
-        yield from timed(self.stats, "local map", self.local_map.inserting(frame, step.pose, segment, matches))
+        yield from timed(self.stats, "local map", self.local_map.inserting(frame, pose, segment, matches))
         self._adjust_window(frame.index)
         yield
         if self.local_map.agreement(frame.index) < self.config.front_end.lost_inliers:

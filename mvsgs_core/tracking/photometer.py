@@ -94,6 +94,15 @@ class Photometer(ImageLights):
         """Takes in the graph's new edges and keyframes. at_the_end: the stream has ended, all is solved for again."""
         whole(self.updating(at_the_end))
 
+    def take_up(self) -> None:
+        """Takes in a map that another run left, part by part as it grew there; the mean is over all its keyframes."""
+        with self.stats.time("photometry"):
+            whole(self._looking_at_edges())
+            order = sorted(self.graph.keyframes)
+            for known in range(AT_ONCE, len(order), AT_ONCE // 2):
+                self._solve(order[:known], False)
+            self._solve(order, True)
+
     def updating(self, at_the_end: bool = False) -> Steps[None]:
         """`update`, an edge a step."""
         yield from timed(self.stats, "photometry", self._updating(at_the_end))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -70,6 +70,13 @@ class Update:
         """With the rest of it done, and not what can be done later."""
         return self if self.rest is None else whole(self.rest)
 
+    def following(self) -> Iterator[Update]:
+        """What the rest comes to, which may have a rest of its own: one after another, each without it."""
+        update = self
+        while update.rest is not None:
+            update = update.begun()
+            yield replace(update, rest=None)
+
     def whole(self) -> Update:
         """With all of it done."""
         update = self.begun()
@@ -122,6 +129,7 @@ class Publisher:
         self.light = light
         self.held: list[int] = []  # keyframes that are not published yet
         self.highest_segment = 0  # that was ever published: no number is given twice
+        self.behind = False  # readers may have later corrections than `known` says: the next ones are of all keyframes
         self._published: dict[int, _Published] = {}
         self._vignetting: np.ndarray | None = None  # that was published last
         self._lit = False  # an exposure was published
@@ -170,8 +178,12 @@ class Publisher:
         return out
 
     def corrections(self, everything: bool = False) -> Correction | None:
-        """Keyframes that moved noticeably, or joined another segment, since they were last published; else None."""
+        """Keyframes that moved noticeably, or joined another segment, since they were last published; else None.
+
+        everything: all that were published.
+        """
         moved = []
+        everything, self.behind = everything or self.behind, False
         vignetting = changed_vignetting(None if self.light is None else self.light.vignetting, self._vignetting)
         if vignetting is not None:
             everything, self._vignetting = True, vignetting

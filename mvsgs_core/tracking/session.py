@@ -115,7 +115,7 @@ class Session:
             yield from self._force_initialization()
         elif last := self._tail.last(self.choice):
             record = record_of(self.records, last[0].index)
-            yield self._begin_work(last[0], record, self._add_keyframe(*last, record)).begun()
+            yield from self._begin_work(last[0], record, self._add_keyframe(*last, record)).following()
             if self.phase is Phase.INITIALIZING:  # the map contradicted it: a part of its own would begin
                 self.initializer.abandon()
         if largest := self.local_map.largest():

@@ -38,6 +38,7 @@ NOT_FOUND = (
     "the camera was not found at once in the map to go on in: a part of its own was begun, which is joined to it where "
     "the camera comes by"
 )
+NOWHERE = "the camera was found in the map in no frame: is it the place that the map shows?"
 SPARED = "keyframes, about: farther apart, as the tracker took more than its share of time"
 
 
@@ -151,7 +152,8 @@ class Tracker:
         record = session.records[newest]
         if record.same_as is not None:
             record = record_of(session.records, record.same_as)
-        return NewestPose(*seen, before[0] if before is not None and same_part else None, record.found_percent / 100)
+        confidence = 1.0 if record.index in session.graph.keyframes else record.found_percent / 100  # all of its own
+        return NewestPose(*seen, before[0] if before is not None and same_part else None, confidence)
 
     def trajectory(self) -> Trajectory:
         """Every frame's pose and exposure, after `finish`."""
@@ -287,9 +289,10 @@ class Tracker:
             stats.skip(SPARED, spared)
         stats.counts["matches"] = session.matcher.calls
         stats.counts["matches that needed features"] = session.matcher.feature_calls
-        self.nothing = "" if graph.keyframes else f"tracking never started: {session.initializer.reason}"
-        if self._frozen and not trajectory.posed.any():
-            self.nothing = "the camera was found in the map in no frame: is it the place that the map shows?"
+        if trajectory.posed.any():
+            self.nothing = ""
+        elif session.records:
+            self.nothing = self._why_nothing(session)
         if self.nothing:
             stats.warn(self.nothing)
         warn_of_gaps(stats, self._trajectory)
@@ -304,6 +307,14 @@ class Tracker:
         yield Update(state, correction=correction)
         if not self._frozen:  # after what the map waits for
             session.calibration.check(session.local_map.largest())
+
+    def _why_nothing(self, session: Session) -> str:
+        """Of a stream no frame of which has a pose."""
+        if not session.graph.keyframes:
+            return f"tracking never started: {session.initializer.reason}"
+        if self._frozen or session.phase is not Phase.INITIALIZING:
+            return NOWHERE
+        return f"the camera was not found in the map, and no part of its own started: {session.initializer.reason}"
 
     def _image(
         self, session: Session, index: int, timestamp: float, image: np.ndarray, exposure: float,

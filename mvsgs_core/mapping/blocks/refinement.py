@@ -16,9 +16,10 @@ WORTH = 1.5  # times the iterations of the whole map that blocks of it may take 
 TOGETHER = 0.05  # of the iterations, the last, over the whole map
 
 
-def refined_in_blocks(mapper: OnlineMapper, total: int) -> Iterator[None] | None:
-    """`total` iterations over the map, a piece at a time; the map changes when all are done. None: the map is to be
-    refined whole, as it is small, or neither blocks nor a cluster are asked for."""
+def refined_in_blocks(mapper: OnlineMapper, total: int) -> Iterator[int] | None:
+    """Of `total` iterations over the map those that blocks make, a piece at a time: yields how many of them are done, 0
+    until the map changes, with the last piece. The rest are ordinary ones, over the whole map. None: all are, as it is
+    small, or neither blocks nor a cluster are asked for."""
     config = mapper.config.refine
     if not mapper.views or not len(mapper.state):
         return None
@@ -40,7 +41,7 @@ def _blocks(mapper: OnlineMapper, machines: int = 1) -> int:
 
 def _here(
     mapper: OnlineMapper, total: int, parting: Parting, results: dict[int, Result] | None = None
-) -> Iterator[None]:
+) -> Iterator[int]:
     """results: of blocks that are done already."""
     results, blocks = results or {}, len(parting)
     for block, iterations in enumerate(iterations_of(mapper, parting, total)):
@@ -50,12 +51,10 @@ def _here(
         for result in refined(job, mapper.config):
             if result is not None:
                 results[block] = result
-            yield
+            yield 0
     merge(mapper, [results[block] for block in sorted(results)])
-    for done in range(total - together(total, blocks), total):
-        mapper.refine(done, total)
-        yield
     mapper.log.values["blocks"] = blocks
+    yield total - together(total, blocks)
 
 
 def together(iterations: int, blocks: int) -> int:
@@ -63,7 +62,7 @@ def together(iterations: int, blocks: int) -> int:
     return round(TOGETHER * iterations) if blocks > 1 else 0
 
 
-def _on_cluster(mapper: OnlineMapper, total: int) -> Iterator[None]:
+def _on_cluster(mapper: OnlineMapper, total: int) -> Iterator[int]:
     """What the cluster cannot do is done here: a stream's map is not lost for want of a machine."""
     results: dict[int, Result] = {}
     parting = None
@@ -76,7 +75,7 @@ def _on_cluster(mapper: OnlineMapper, total: int) -> Iterator[None]:
             )
             for finished in cluster.refined(jobs, plain(mapper.config)):
                 results.update(finished)
-                yield
+                yield 0
             mapper.log.values["machines"] = cluster.machines
     except ClusterError as error:
         mapper.log.warn(f"the Ray cluster at {mapper.config.refine.address} failed, the map is refined here: {error}")

@@ -64,8 +64,9 @@ def save(
 def load(output: Path, config: MapperConfig, log: Stats, *, counted: bool = True) -> tuple[Atlas, Path]:
     """The atlas of the newest whole checkpoint in a run's output directory, and its file.
 
-    `log` gets what that run had counted, where it is wanted, and warnings of what was wrong with newer checkpoints and
-    of what of `config` is not as it was. Raises ValueError where there is none, or `config` does not fit.
+    `log` gets what that run had counted, and that it was resumed, where it is wanted; and warnings of what was wrong
+    with newer checkpoints and of what of `config` is not as it was. Raises ValueError where there is none, or `config`
+    does not fit.
     """
     problems: list[str] = []
     for file in state_files(output):
@@ -117,6 +118,7 @@ def _load(file: Path, config: MapperConfig, log: Stats, counted: bool) -> Atlas:
     )  # fmt: skip
     if counted:
         log.include(logged)
+        log.values["resumed"] = str(file)
     if differing:
         log.warn(f"the run goes on with other parameters than it had: {', '.join(differing)}")
     return atlas

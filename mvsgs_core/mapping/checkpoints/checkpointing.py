@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import shutil
 import tempfile
 import time
@@ -13,13 +12,12 @@ from mvsgs_core.export.source_camera import SourceCamera
 from mvsgs_core.kept_map import FOLDER
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.results import remove_results, write_results
-from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
+from mvsgs_core.mapping.checkpoints.writer import FULL, CheckpointWriter
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.stats import Stats
 
 MAX_FRACTION = 0.02  # of the mapper's time, at most, that copying the map for checkpoints holds it up
 PATIENCE, BETWEEN = 60.0, 1.0  # seconds that a full disk is waited for at the end, and between two attempts
-FULL = (errno.ENOSPC, errno.EDQUOT)  # a disk, or what a user may have of it
 LAST = 2.5  # seconds for the last checkpoint of a run that ends early
 
 

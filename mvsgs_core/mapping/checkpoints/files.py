@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ import numpy as np
 
 from mvsgs_core.array_file import read_arrays, write_arrays
 from mvsgs_core.kept_map import FOLDER
+from mvsgs_core.mapping.checkpoints.pixels import read_pixels
 
 KEYFRAMES = "keyframes"
 FORMAT, VERSION = "mvsgs checkpoint", 10
@@ -47,7 +48,8 @@ class CheckpointInfo:
 
 
 def checkpoint_info(output: Path | str) -> CheckpointInfo:
-    """Of the newest whole checkpoint in a run's output directory. Raises ValueError saying what is wrong.
+    """Of the newest whole checkpoint in a run's output directory, which is the one that `load` takes: images are read
+    here, too, where an older one does without them. Raises ValueError saying what is wrong.
 
     To go on where the source can be read again: the same graph from the stream's beginning, with `mapper.resume=output`
     and, where the node has that parameter, `mvs.resume_after=info.stereo_after()`. The tracker finds its poses again,
@@ -55,10 +57,10 @@ def checkpoint_info(output: Path | str) -> CheckpointInfo:
     dataset.path=output mapper.resume=output mapper.reads={FusedKeyframe: dataset, Poses: dataset}`, tracker, mvs and
     depth_fusion off, and the evaluator's Trajectory and FusedKeyframe from dataset.
     """
-    problems = []
-    for file in state_files(Path(output)):
+    problems, files = [], state_files(Path(output))
+    for k, file in enumerate(files):
         try:
-            return _info(file)
+            return _info(file, files[k + 1 :])
         except ValueError as error:
             problems.append(str(error))
     raise ValueError("; ".join(problems) or nothing_there(Path(output)))
@@ -130,9 +132,13 @@ def _check_images(file: Path, names: set[str]) -> None:
         )
 
 
-def _info(file: Path) -> CheckpointInfo:
+def _info(file: Path, before: Sequence[Path]) -> CheckpointInfo:
+    """before: the older states, one of which is taken instead where an image that it does not need is damaged."""
     meta, arrays = read_state(file)
-    _check_images(file, _images(meta))
+    names = _images(meta)
+    _check_images(file, names)
+    for name in set[str]().union(*(names - images_of(older) for older in before)):
+        read_pixels(file.parent / KEYFRAMES, name)
     keyframes = np.sort(arrays["keyframes"])
     return CheckpointInfo(
         file, meta["newest_view"], meta["stream_seconds"], keyframes, meta["splats"], meta["stream_ended"]

@@ -6,8 +6,6 @@ says at once whether an image is written already, and a damaged or foreign one i
 
 from __future__ import annotations
 
-import re
-import zlib
 from pathlib import Path
 
 import cv2
@@ -16,6 +14,7 @@ import torch
 from torch import Tensor
 
 from mvsgs_core.atomic_file import replacing
+from mvsgs_core.mapping.checkpoints.pixels import checksum, read_pixels
 from mvsgs_core.mapping.keyframes import TrainingView
 
 QUICK = [  # half the time that the encoder's own choice takes, for photographs of about the same size
@@ -23,12 +22,11 @@ QUICK = [  # half the time that the encoder's own choice takes, for photographs 
     cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
     cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB,
 ]  # fmt: skip
-NAME = re.compile(r"-?\d{1,19}-[0-9a-f]{8}\.png", re.ASCII)  # frame index, checksum
 
 
 def image_name(view: TrainingView) -> str:
     """File name of a keyframe's image; empty where it was let go."""
-    return f"{view.index:06d}-{_checksum(pixels_of(view)):08x}.png" if view.has_image else ""
+    return f"{view.index:06d}-{checksum(pixels_of(view)):08x}.png" if view.has_image else ""
 
 
 def write_image(folder: Path, view: TrainingView, name: str, *, sync: bool) -> None:
@@ -51,19 +49,7 @@ def read_image(folder: Path, name: str) -> tuple[Tensor, Tensor | None]:
     """
     if not name:
         return torch.zeros((0, 0, 3), dtype=torch.uint8), None
-    if not NAME.fullmatch(name):
-        raise ValueError(f"{name!r} is no name of a keyframe's image")
-    try:
-        data = np.fromfile(folder / name, dtype=np.uint8)
-        found = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if _plausible(data) else None
-    except (OSError, cv2.error) as error:
-        raise ValueError(f"{folder / name} cannot be read: {error}") from error
-    if found is None or found.dtype != np.uint8 or found.ndim != 3:
-        raise ValueError(f"{folder / name} is damaged: no image of a keyframe")
-    pixels = cv2.cvtColor(found, cv2.COLOR_BGRA2RGBA if found.shape[2] == 4 else cv2.COLOR_BGR2RGB)
-    if f"{_checksum(pixels):08x}" != name[-12:-4]:
-        raise ValueError(f"{folder / name} is damaged: it shows something else than its name says")
-    return image_of(pixels)
+    return image_of(read_pixels(folder, name))
 
 
 def image_of(pixels: np.ndarray) -> tuple[Tensor, Tensor | None]:
@@ -76,13 +62,3 @@ def pixels_of(view: TrainingView) -> np.ndarray:
     """(H, W, 3), or with the valid pixels as alpha (H, W, 4), uint8."""
     image = np.ascontiguousarray(view.image.cpu().numpy())
     return image if view.valid is None else np.dstack([image, view.valid.cpu().numpy().astype(np.uint8) * 255])
-
-
-def _plausible(data: np.ndarray) -> bool:
-    """Whether the header claims no more pixels than deflate can have made of so few bytes: 1,032 of one."""
-    width, height = np.frombuffer(data[16:24].tobytes().ljust(8, b"\0"), dtype=">u4").tolist()
-    return 0 < width * height <= 1032 * len(data)
-
-
-def _checksum(pixels: np.ndarray) -> int:
-    return zlib.crc32(np.ascontiguousarray(pixels).data, zlib.crc32(repr(pixels.shape).encode()))

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import queue
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 from torch import Tensor
 
-from mvsgs_core.kept_map import FOLDER
+from mvsgs_core.kept_map import FOLDER, TRACKER
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.checkpoint import save
 from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, images_of, number_of, state_file, state_files
@@ -22,17 +23,19 @@ from mvsgs_core.mapping.checkpoints.results import write_results
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import TrainingView
 
+FULL = (errno.ENOSPC, errno.EDQUOT)  # a disk, or what a user may have of it
 AHEAD = 8  # keyframes whose images may wait to be written before their checkpoint is
 ASIDE = (  # what a killed process left half written, see `atomic_file`
     ".map.*.ply", ".trajectory.*.txt", ".cameras.*.json", ".transforms.*.json", "keyframes/.*.png",
-    f"{FOLDER}/.state-*.npz",
+    f"{FOLDER}/.state-*.npz", f"{FOLDER}/.{TRACKER}",
 )  # fmt: skip
 
 
 class CheckpointWriter:
     """One checkpoint after the other into `output`, of which the newest two stay, with map.ply and trajectory.txt.
 
-    What cannot be written is a line in `problems`; the checkpoint before then stays. No method raises OSError.
+    What cannot be written is a line in `problems`; the checkpoint before then stays. No method but `write` and
+    `keep_newest` raises OSError.
     """
 
     def __init__(self, output: Path, config: MapperConfig, resumed: Path | None = None) -> None:
@@ -48,7 +51,10 @@ class CheckpointWriter:
         self._left = 0  # and jobs of any kind
         self._thread: threading.Thread | None = None
         self.problems: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self._remove_parts()  # now, as nothing is being written
+        with contextlib.suppress(OSError):  # now, as nothing is being written
+            self._remove_parts()
+            if resumed is not None and number_of(resumed) < self._number:
+                self.keep_newest()  # newer ones were damaged: their images are to be written anew
 
     @property
     def busy(self) -> bool:
@@ -68,9 +74,9 @@ class CheckpointWriter:
         self._do(lambda: self._write(atlas, sync, results))
 
     def write(self, atlas: Atlas) -> None:
-        """Writes a frozen atlas's state now, which stays there alone; nothing else is being written. Raises OSError."""
+        """Writes a frozen atlas's state now, beside those that are there until `keep_newest`; nothing else is being
+        written. Raises OSError."""
         self._write_state(atlas, sync=True)
-        self.keep_newest()
 
     def wait(self, seconds: float | None = None) -> bool:
         """Whether all that was begun is done, by then. None: however long it takes."""
@@ -83,7 +89,7 @@ class CheckpointWriter:
             self._jobs.put(None)
 
     def keep_newest(self) -> None:
-        """Removes all but the newest checkpoint, where one was written; nothing is being written."""
+        """Removes all but the newest checkpoint, where one was written; nothing is being written. Raises OSError."""
         if self._before is not None:
             self._remove_others({self._before}, self._images_before)
 
@@ -98,12 +104,8 @@ class CheckpointWriter:
     def _run(self) -> None:
         while (job := self._jobs.get()) is not None:
             try:
-                job()
-            except OSError as error:
-                self.problems.put(
-                    f"no checkpoint can be written to {self._output / FOLDER}: {error.strerror or error}; the run goes "
-                    "on and the last checkpoint stays: make room there"
-                )
+                with self._telling(f"no checkpoint can be written to {self._output / FOLDER}"):
+                    job()
             except Exception as error:  # of the checkpoint only: the map is not lost for it, and nothing is hidden
                 logging.exception("checkpoint")
                 self.problems.put(f"a checkpoint failed, the run goes on: {type(error).__name__}: {error}")
@@ -113,11 +115,24 @@ class CheckpointWriter:
                     self._left -= 1
                     self._changed.notify_all()
 
+    @contextlib.contextmanager
+    def _telling(self, what: str) -> Iterator[None]:
+        """Where the disk refuses something, that it could not be done is a problem."""
+        try:
+            yield
+        except OSError as error:
+            room = ": make room there" if error.errno in FULL else ""
+            self.problems.put(f"{what}: {error.strerror or error}; the run goes on and the last checkpoint stays{room}")
+
     def _write(self, atlas: Atlas, sync: bool, results: bool) -> None:
         try:
+            before, images = self._before, self._images_before
             self._write_state(atlas, sync)
+            with self._telling(f"earlier checkpoints cannot be removed from {self._output / FOLDER}"):
+                self._remove_others({self._before, before}, self._images_before | images)
             if results:
-                write_results(self._output, atlas.largest, sync=sync)
+                with self._telling(f"map.ply and what lies beside it cannot be written to {self._output}"):
+                    write_results(self._output, atlas.largest, sync=sync)
         finally:
             with self._changed:
                 self._pending -= 1
@@ -134,9 +149,8 @@ class CheckpointWriter:
         file = state_file(self._output, self._number + 1)
         save(atlas, self._config, file, known, sync=sync)
         self._number += 1
-        images = {name for both in known.values() for names in both for name in names if name}
-        self._remove_others({file, self._before}, images | self._images_before)
-        self._before, self._images_before = file, images
+        self._before = file
+        self._images_before = {name for both in known.values() for names in both for name in names if name}
         present = {view.index for part in atlas.parts.values() for view in part.keyframes.trained}
         self._names = {index: entry for index, entry in self._names.items() if index in present}
 
@@ -163,6 +177,5 @@ class CheckpointWriter:
 
     def _remove_parts(self) -> None:
         """Of a process that was killed while it wrote."""
-        with contextlib.suppress(OSError):
-            for file in [file for pattern in ASIDE for file in self._output.glob(pattern)]:
-                file.unlink(missing_ok=True)
+        for file in [file for pattern in ASIDE for file in self._output.glob(pattern)]:
+            file.unlink(missing_ok=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +14,10 @@ from mvsgs_core.mapping.blocks.config import RefineConfig
 from mvsgs_core.mapping.blocks.job import NOBODY, iterations_of, job_of, merge, parting_of, refined
 from mvsgs_core.mapping.blocks.parting import Parting, part
 from mvsgs_core.mapping.blocks.refinement import refined_in_blocks, together
+from mvsgs_core.mapping.checkpoints.checkpoint import load
 from mvsgs_core.mapping.mapper import OnlineMapper
-from tests.support.small_atlas import PLAIN, begun
+from mvsgs_core.stats import Stats
+from tests.support.small_atlas import PLAIN, begun, written
 from tests.support.small_maps import CONFIG, mapped, score
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
@@ -30,9 +33,15 @@ def corridor(blocks: int | None = 2, keyframes: int = 8, overlap: float = 0.1) -
 
 
 def refine(mapper: OnlineMapper, total: int) -> int:
-    """In pieces; how many they were, 0: it is to be refined whole."""
+    """In blocks, then whole; in how many pieces the former were, 0: it is to be refined whole."""
     pieces = refined_in_blocks(mapper, total)
-    return 0 if pieces is None else sum(1 for _ in pieces)
+    if pieces is None:
+        return 0
+    *waits, merged = pieces
+    assert not any(waits)
+    for done in range(merged, total):
+        mapper.refine(done, total)
+    return len(waits) + 1
 
 
 def test_one_block_is_the_refinement_of_the_whole_map_to_the_bit() -> None:
@@ -206,6 +215,32 @@ def test_a_small_map_is_refined_whole_and_a_large_one_in_blocks() -> None:
         assert len(atlas.current.log.values) == 0 or atlas.refined == 6
     assert atlas.current.log.values["blocks"] == 2
     assert not atlas.refine()
+
+
+def test_what_is_cut_off_after_the_blocks_goes_on_in_the_merged_map(tmp_path: Path) -> None:
+    """And gives the same map, to the bit; cut off before, the map is as it was, and the blocks are made again."""
+
+    def in_parts(cut: int | None) -> tuple[Atlas, list[int]]:
+        atlas, total, done = Atlas(corridor()), 40, []
+        atlas.parts[0] = atlas.current
+        atlas.current.config = replace(atlas.current.config, refinement=total)
+        while atlas.refine():
+            done.append(atlas.refined)
+            if len(done) == cut:
+                written(atlas, tmp_path / f"{cut}")
+                atlas = load(tmp_path / f"{cut}", atlas.current.config, Stats())[0]
+        return atlas, done
+
+    whole, done = in_parts(None)
+    blocks = done.count(0)
+    assert done[blocks:] == [38, 39, 40]
+    for cut in (blocks // 2, blocks + 1, blocks + 2):
+        again, others = in_parts(cut)
+        assert others[cut:] == done[cut if cut > blocks else 0 :]
+        for name, value in whole.current.state.tensors().items():
+            assert torch.equal(value, again.current.state.tensors()[name]), (cut, name)
+        assert again.current.iterations == whole.current.iterations
+        assert again.current.log.counts == whole.current.log.counts
 
 
 def test_keyframes_that_all_see_the_same_are_refined_whole_unless_blocks_are_asked_for() -> None:

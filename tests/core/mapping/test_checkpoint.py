@@ -29,6 +29,7 @@ from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
 from mvsgs_core.mapping.density_control import DensityControlConfig
 from mvsgs_core.mapping.keyframes import ConvergenceConfig
+from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.stats import Stats
 from tests.support.patience import LONG
 from tests.support.small_atlas import PLAIN, VIGNETTING, begun, view, written
@@ -207,6 +208,62 @@ def test_an_image_that_is_missing_or_another_is_refused(tmp_path: Path) -> None:
         load(tmp_path, PLAIN, Stats())
     with pytest.raises(ValueError, match=f"1 are missing, such as {first.name}: copy the whole folder"):
         checkpoint_info(tmp_path)  # what is asked before anything starts
+
+
+def two_checkpoints(output: Path) -> tuple[Path, Path]:
+    """The states of a map of four keyframes, and before of three: the newest, the one before."""
+    atlas, writer = Atlas(OnlineMapper(replace(PLAIN, iterations=0))), CheckpointWriter(output, PLAIN)
+    for index in range(4):
+        atlas.add(view(index), 0)
+        if index > 1:
+            writer.submit(atlas.frozen())
+            assert writer.wait(LONG)
+    newest, before = state_files(output)
+    return newest, before
+
+
+@pytest.mark.parametrize("damaged", ["cut off", "empty", "of another keyframe"])
+def test_launcher_source_and_mapper_pass_over_a_state_with_a_damaged_image(tmp_path: Path, damaged: str) -> None:
+    """As where the machine lost power before what a run that ended early had left was on the disk."""
+    newest, before = two_checkpoints(tmp_path)
+    assert checkpoint_info(tmp_path).file == newest
+    *_, other, last = sorted(newest.parent.glob(f"{KEYFRAMES}/*.png"))
+    data = {"cut off": last.read_bytes()[:100], "empty": b"", "of another keyframe": other.read_bytes()}
+    last.write_bytes(data[damaged])
+    log = Stats()
+    atlas, file = load(tmp_path, PLAIN, log)
+    assert file == before
+    assert any("an older checkpoint was taken" in text and last.name in text for text in log.warnings)
+    info = checkpoint_info(tmp_path)
+    assert (info.file, info.newest_keyframe_index) == (before, atlas.newest_view)
+    kept = kept_keyframes(tmp_path)
+    assert [keyframe.index for keyframe in kept] == [0, 1, 2]
+    assert all(keyframe.image() is not None for keyframe in kept)
+
+
+def test_a_run_that_goes_on_from_the_state_before_writes_the_damaged_image_anew(tmp_path: Path) -> None:
+    newest, before = two_checkpoints(tmp_path)
+    last = max(newest.parent.glob(f"{KEYFRAMES}/*.png"))
+    whole = last.read_bytes()
+    last.write_bytes(whole[:100])
+    atlas, file = load(tmp_path, PLAIN, Stats())
+    writer = CheckpointWriter(tmp_path, PLAIN, file)
+    assert state_files(tmp_path) == [before]
+    atlas.add(view(3), 0)
+    writer.submit(atlas.frozen())
+    assert writer.wait(LONG)
+    assert last.read_bytes() == whole
+    assert load(tmp_path, PLAIN, Stats())[0].newest_view == 3
+
+
+def test_an_image_that_all_states_need_is_looked_at_by_the_mapper_alone(tmp_path: Path) -> None:
+    """There is no other state to take, and of a large map to look at all takes as long as to load it."""
+    newest, _ = two_checkpoints(tmp_path)
+    first = min(newest.parent.glob(f"{KEYFRAMES}/*.png"))
+    first.write_bytes(first.read_bytes()[:100])
+    assert checkpoint_info(tmp_path).file == newest
+    with pytest.raises(ValueError, match=f"{first.name} is damaged"):
+        load(tmp_path, PLAIN, Stats())
 
 
 def test_other_parameters_are_said_and_refused_where_the_map_depends_on_them(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from mvsgs_core.export.cameras import read_source_camera
 from mvsgs_core.export.ply import read_ply
 from mvsgs_core.export.source_camera import GIVEN, SourceCamera
 from mvsgs_core.mapping.atlas import Atlas
-from mvsgs_core.mapping.checkpoints import checkpointing
+from mvsgs_core.mapping.checkpoints import checkpointing, writer
 from mvsgs_core.mapping.checkpoints.checkpointing import MAX_FRACTION, Checkpointing
 from mvsgs_core.mapping.checkpoints.files import FOLDER, checkpoint_info, state_files
 from mvsgs_core.mapping.checkpoints.results import write_results
@@ -125,7 +125,8 @@ def test_every_checkpoint_leaves_a_map_and_the_keyframes_poses(tmp_path: Path) -
     np.testing.assert_allclose(poses, final.world_from_cam, atol=1e-6)
 
 
-def test_a_full_disk_is_said_and_the_checkpoint_before_stays(tmp_path: Path) -> None:
+def test_a_full_disk_is_said_and_the_checkpoint_before_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(writer, "FULL", (errno.EFBIG,))  # `full_after` says that the file is too large
     atlas, clock = begun(PLAIN), Clock()
     checkpoints = Checkpointing(tmp_path, 30.0, atlas, clock=clock)
     assert times(checkpoints, atlas) == 1
@@ -142,6 +143,45 @@ def test_a_full_disk_is_said_and_the_checkpoint_before_stays(tmp_path: Path) -> 
     clock.now += 40.0
     assert times(checkpoints, atlas) == 3
     assert checkpoint_info(tmp_path).keyframes.tolist() == [0, 1, 2, 3, 4, 5, 7]
+
+
+@pytest.mark.parametrize(
+    ("number", "of", "said"),
+    [
+        (errno.ENOSPC, "save", "no checkpoint can be written to {}/checkpoint: "),
+        (errno.EACCES, "save", "no checkpoint can be written to {}/checkpoint: "),
+        (errno.EROFS, "write_image", "no checkpoint can be written to {}/checkpoint: "),
+        (errno.EIO, "write_results", "map.ply and what lies beside it cannot be written to {}: "),
+        (errno.ENOSPC, "write_results", "map.ply and what lies beside it cannot be written to {}: "),
+        (errno.EACCES, "CheckpointWriter._remove_others", "earlier checkpoints cannot be removed from {}/checkpoint: "),
+    ],
+)
+def test_what_cannot_be_written_is_named_and_room_is_asked_for_where_there_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, of: str, said: str
+) -> None:
+    atlas, clock = begun(PLAIN), Clock()
+    checkpoints = Checkpointing(tmp_path, 30.0, atlas, clock=clock)
+    assert times(checkpoints, atlas) == 1
+
+    def failing(*_: object, **__: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(f"mvsgs_core.mapping.checkpoints.writer.{of}", failing)
+    clock.now += 40.0
+    atlas.current.add_keyframe(view(7))
+    assert times(checkpoints, atlas) == 2
+    checkpoints.keep(atlas)
+    (problem,) = [text for text in atlas.current.log.warnings if os.strerror(number) in text]
+    assert problem == (
+        f"{said.format(tmp_path)}{os.strerror(number)}; the run goes on and the last checkpoint stays"
+        + (": make room there" if number == errno.ENOSPC else "")
+    )
+    state_there = of not in ("save", "write_image")
+    assert checkpoint_info(tmp_path).keyframes.tolist() == [0, 1, 2, 3, 4, 5] + [7] * state_there
+    monkeypatch.undo()
+    clock.now += 40.0
+    assert times(checkpoints, atlas) == 3, "it is to be saved still"
+    assert len(state_files(tmp_path)) == 2
 
 
 def test_a_final_map_that_cannot_be_written_is_an_error_and_leaves_the_one_before(tmp_path: Path) -> None:
@@ -246,26 +286,26 @@ def test_the_checkpoint_of_a_finished_map_is_made_where_wanted(tmp_path: Path) -
 
 
 def test_a_copy_that_is_written_is_let_go(tmp_path: Path) -> None:
-    writer, copy = CheckpointWriter(tmp_path, PLAIN), begun(PLAIN).frozen()
+    checkpoints, copy = CheckpointWriter(tmp_path, PLAIN), begun(PLAIN).frozen()
     written = weakref.ref(copy)
-    writer.submit(copy)
+    checkpoints.submit(copy)
     del copy
-    assert writer.wait(LONG)
+    assert checkpoints.wait(LONG)
     assert written() is None
 
 
 def test_an_image_that_went_to_disk_is_not_kept_in_memory_for_its_name(tmp_path: Path) -> None:
     atlas = begun(PLAIN)
-    writer, (first, *_) = CheckpointWriter(tmp_path, PLAIN), atlas.current.views
+    checkpoints, (first, *_) = CheckpointWriter(tmp_path, PLAIN), atlas.current.views
     in_memory = weakref.ref(first.image)
-    writer.prepare(first)
-    assert writer.wait(LONG)
+    checkpoints.prepare(first)
+    assert checkpoints.wait(LONG)
     files = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.png")}
     assert len(files) == 1
     assert rest(first, atlas.current.log)
     assert in_memory() is None
-    writer.prepare(first)
-    assert writer.wait(LONG)
+    checkpoints.prepare(first)
+    assert checkpoints.wait(LONG)
     assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.png")} == files
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from mvsgs_core import geometry
@@ -233,3 +234,25 @@ def test_a_part_without_a_keyframe_is_no_part_of_the_map() -> None:
     assert atlas.current.log.values["segments_apart"] == 0
     assert not any("lost" in text for text in atlas.current.log.warnings)
     assert [known.index for known in atlas.current.views] == [0, 1, 2], "that of the keyframes is gone on with"
+
+
+@pytest.mark.parametrize("spent", [None, 0, 1])
+def test_a_join_leaves_the_keyframes_that_its_correction_moved_what_they_are_owed(spent: int | None) -> None:
+    """spent: a part of which nothing that was owed is left, by its segment; the stream is in the later one."""
+    atlas = Atlas(OnlineMapper(CONFIG))
+    for index in (0, 1, 3, 4):
+        atlas.add(keyframe(index), int(index > 2))
+        while atlas.step():
+            pass
+    for part in atlas.parts.values():
+        for view in part.views:
+            view.loss_fast = 0.0  # to which it never comes back
+    if spent is not None:
+        atlas.parts[spent].schedule.beside = 0
+    before, moved = sum(part.iterations for part in atlas.parts.values()), np.array([0, 1, 3, 4])
+    poses = np.stack([AWAY @ pose_on_arc(k / 8) for k in moved])
+    atlas.correct(moved, poses, np.ones(4), np.zeros(4, np.int32))
+    assert len(atlas.parts) == 1
+    while atlas.step():
+        pass
+    assert atlas.current.iterations - before == CONFIG.iterations

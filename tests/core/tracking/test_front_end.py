@@ -42,6 +42,22 @@ def at(number: int, seconds: float) -> TrackingImage:
     return view
 
 
+def test_a_pose_moves_with_its_reference() -> None:
+    """As a loop moves it, and a part of the map is joined to one of another unit."""
+    made = front_end(0)
+    step = made.follow(image(4), with_pose=True)
+    assert step.pose_in(made.graph) is step.pose
+    moved = geometry.se3_exp(np.array([0.5, -0.3, 0.2, 0.1, 0.4, -0.2]))
+    keyframe = made.graph.keyframes[0]
+    keyframe.cam_from_world = keyframe.cam_from_world @ moved
+    made.graph.rescale([0], 3.0)
+    expected = geometry.scaled(step.pose @ moved, 3.0)
+    np.testing.assert_allclose(step.pose_in(made.graph), expected, atol=1e-9)
+    again = made.follow(image(4), with_pose=True)
+    assert again.still, "it is the same frame, as it was found before"
+    np.testing.assert_allclose(again.pose_in(made.graph), expected, atol=1e-9)
+
+
 def test_poses_are_found_frame_by_frame() -> None:
     made = front_end(0)
     steps = {number: made.follow(image(number), with_pose=True) for number in (2, 4, 6)}

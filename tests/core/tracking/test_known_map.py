@@ -18,6 +18,7 @@ from mvsgs_core.tracking.known_map import FORMAT, VERSION, WHAT, KnownMap, load
 from mvsgs_core.tracking.phase import Phase
 from mvsgs_core.tracking.places.relocalization import Relocalizer
 from mvsgs_core.tracking.tracker import Tracker, TrackerConfig
+from mvsgs_core.trajectory import TrackingState
 from tests.support.sequences import synthetic, tracked_room
 
 pytestmark = pytest.mark.slow
@@ -108,6 +109,19 @@ def test_a_map_of_several_parts_has_the_readout_time_of_the_largest(file: Path) 
     assert session.calibration.readout_of == count - count // 3
 
 
+def test_who_goes_on_in_the_same_run_tells_readers_where_all_keyframes_are(file: Path) -> None:
+    """They may have later corrections than the map that was saved. On a map of another run readers begin with it."""
+    first, known = back()[0], load(file)
+    for again in (True, False):
+        tracker = Tracker(known=known if again else known.renumbered(STREAM))
+        publisher = tracker.begin(first.image.shape[:2], first.intrinsics).publisher
+        correction = publisher.corrections()
+        assert (correction is not None) == again
+        if correction is not None:
+            assert correction.index.tolist() == [keyframe.index for keyframe in known.keyframes]
+        assert publisher.corrections() is None
+
+
 def test_the_camera_is_found_and_tracked_in_the_frame_of_the_map(file: Path) -> None:
     """From the other direction, darker, at larger steps: poses are the first run's, to a hundredth of a depth."""
     items, first = back(), {int(i): pose for i, pose in zip(tracked_room()[1].index, tracked_room()[1].world_from_cam)}
@@ -139,6 +153,29 @@ def test_another_scene_is_not_found_and_gets_a_part_of_its_own(file: Path) -> No
     list(tracker.finish())
     assert not set(tracker.trajectory().segment.tolist()) & known.segments
     assert any("was not found at once" in warning for warning in tracker.stats.warnings)
+
+
+def test_a_stream_that_is_neither_found_in_the_map_nor_starts_has_a_reason(file: Path, tmp_path: Path) -> None:
+    """The map stays as it was, and can be kept."""
+    first = replace(synthetic(frames=40, scene="aerial")[0], intrinsics=synthetic(frames=80)[0].intrinsics)
+    tracker = returning(load(file), [first] * 14)
+    list(tracker.finish())
+    assert not tracker.trajectory().posed.any()
+    assert "not found in the map" in tracker.nothing
+    assert "too little motion: the image moved by 0.0 %" in tracker.nothing
+    assert tracker.nothing in list(tracker.stats.warnings)
+    tracker.keep_map(tmp_path / "tracker.npz")
+    kept, known = load(tmp_path / "tracker.npz").keyframes, load(file).renumbered(STREAM).keyframes
+    assert [keyframe.index for keyframe in kept] == [keyframe.index for keyframe in known]
+    states = tracker.trajectory().state
+    lost, unstarted = (int(np.sum(states == s)) for s in (TrackingState.LOST, TrackingState.NOT_INITIALIZED))
+    assert unstarted > 0
+    assert f"{lost} of 14 frames were lost" in list(tracker.stats.warnings)
+    assert f"{unstarted} of 14 frames came before a start and have no pose" in list(tracker.stats.warnings)
+    short = returning(load(file), [first] * 3)
+    list(short.finish())
+    assert short.phase is Phase.RELOCALIZING
+    assert "in no frame" in short.nothing
 
 
 def test_a_stream_may_begin_where_nothing_is_seen(file: Path) -> None:
@@ -180,6 +217,24 @@ def test_another_camera_is_refused(file: Path) -> None:
         returning(load(file), [replace(item, intrinsics=item.intrinsics * [1.2, 1.2, 1.0, 1.0])])
     with pytest.raises(BadFileError, match="same shape"):
         returning(load(file), [replace(item, image=np.ascontiguousarray(item.image[:, :160]))])
+
+
+def test_a_guess_that_is_not_the_maps_camera_but_for_the_focal_length_is_refused(file: Path) -> None:
+    """Keyframes would go out with the guess's middle of the image, and poses be found with the map's."""
+    item, known, shift = back()[0], load(file), np.array([0.0, 0.0, 16.0, -8.0])
+    wide = 1.2 * item.intrinsics  # of images of more pixels, in which the user is told
+    camera = known.intrinsics + shift
+    scale = item.image.shape[1] / known.size[1]
+    fx, fy, cx, cy = wide + 1.2 * scale * shift
+    told = rf"dataset\.intrinsics=\[{fx:.1f},{fy:.1f},{cx:.1f},{cy:.1f}\]"
+    for factor in (1.0, 1.3):
+        tracker = Tracker(known=replace(known, intrinsics=camera))
+        guess = [factor, factor, 1.0, 1.0]
+        with pytest.raises(BadFileError, match=f"another camera.* guess.*{told}"):
+            tracker.begin(item.image.shape[:2], item.intrinsics * guess, True, wide * guess)
+    taller = Tracker(known=replace(known, intrinsics=known.intrinsics * [1.0, 1.1, 1.0, 1.0]))
+    with pytest.raises(BadFileError, match="another camera"):
+        taller.begin(item.image.shape[:2], item.intrinsics, True)
 
 
 def test_what_is_damaged_or_of_another_version_is_refused(file: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -131,14 +132,17 @@ def test_only_of_many_keyframes_those_out_of_reach_are_left_out(monkeypatch: pyt
     assert set(before) <= set(asked)
 
 
-def flickering() -> tuple[KeyframeGraph, np.ndarray]:
-    """Keyframes of one view whose light changes, with edges between neighbors; and their log gains (K,)."""
+def flickering(steady: int = 0) -> tuple[KeyframeGraph, np.ndarray]:
+    """Keyframes of one view whose light changes, but for so many newest ones, with edges between neighbors; and their
+    log gains (K,)."""
     random, graph = np.random.default_rng(3), KeyframeGraph(np.array([80.0, 80.0, 47.5, 31.5]))
     scene = cv2.GaussianBlur(random.uniform(0, 255, (32, 48, 3)).astype(np.float32), (5, 5), 0)
     scene = cv2.normalize(scene, None, 60.0, 130.0, cv2.NORM_MINMAX)
     rough, gains = random.integers(0, 256, (64, 96), np.uint8), 0.35 * np.sin(1.3 * np.arange(20))
+    gains[20 - steady :] = gains[19 - steady]
     for n, gain in enumerate(gains):
-        half = np.rint(scene * np.exp(gain)).astype(np.uint8)
+        noise = random.normal(0.0, 1.0 if steady else 0.0, scene.shape)
+        half = np.rint(scene * np.exp(gain) + noise).astype(np.uint8)
         image = TrackingImage(n, float(n), rough, half_color=half)
         count = len(image.cells.points)
         graph.add(Keyframe(image, np.eye(4), np.full(count, 0.5), np.full(count, 1e3), 0))
@@ -165,6 +169,38 @@ def test_exposures_of_many_keyframes_are_solved_for_the_newest(at_once: int, mon
     found = [np.log(np.trace(light.exposure(index)[:, :3]) / 3) for index in growing.keyframes]
     off = np.array(found) - (gains - gains.mean())
     assert np.abs(off - off.mean()).max() < 0.02
+
+
+def log_gains(light: photometer.Photometer, graph: KeyframeGraph) -> np.ndarray:
+    """(K,) by the exposures of the keyframes, which are all known."""
+    exposures = [light.exposure(index) for index in graph.keyframes]
+    return np.array([np.nan if e is None else np.log(np.trace(e[:, :3]) / 3) for e in exposures])
+
+
+@pytest.mark.parametrize("steady", [False, True], ids=["changing", "steady newest"])
+@pytest.mark.parametrize("at_once", [300, 9])
+def test_the_light_of_a_map_that_is_taken_up_is_that_of_the_run_before(
+    at_once: int, steady: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What frames are found to look like is told against the map's colors: the mean is over all keyframes."""
+    monkeypatch.setattr(photometer, "AT_ONCE", at_once)
+    graph, gains = flickering(steady=9 if steady else 0)
+    light = photometer.Photometer(graph, Stats())
+    light.take_up()
+    assert light.varies
+    np.testing.assert_allclose(log_gains(light, graph), gains - gains.mean(), atol=0.03)
+    index = max(graph.keyframes) + 1
+    keyframe = graph.keyframes[index - 1]
+    graph.add(
+        Keyframe(replace(keyframe.image, index=index), np.eye(4), keyframe.inverse_depth, keyframe.information, 0)
+    )
+    points = keyframe.points
+    assert graph.connect(index - 1, index, Matches(points.copy(), np.ones(len(points))), 0.1)
+    before = log_gains(light, graph)[:-1]
+    light.update()
+    after = log_gains(light, graph)
+    np.testing.assert_allclose(after[:-1], before, atol=1e-3)
+    assert after[-1] == pytest.approx(before[-1], abs=0.02)
 
 
 def drifting(count: int, growth: float) -> tuple[np.ndarray, np.ndarray, SimilarityEdges]:

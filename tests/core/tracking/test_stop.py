@@ -50,6 +50,23 @@ def test_a_bad_frame_costs_no_other_than_itself(bad: str) -> None:
     np.testing.assert_array_equal(tracker.trajectory().state[-4:], states)
 
 
+def test_a_camera_that_rests_where_its_map_began_is_as_sure_as_its_keyframe() -> None:
+    tracker = Tracker()
+    for item in synthetic(frames=80):
+        tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
+        if tracker.phase is Phase.TRACKING:
+            break
+    last = tracker.session.records[-1].index
+    assert last in tracker.session.graph.keyframes
+    for n in range(2):
+        pose = tracker.newest_pose()
+        assert pose is not None
+        assert pose.confidence == 1.0
+        if n == 0:
+            tracker.add(last + 1, item.timestamp + 0.05, item.image, item.intrinsics)
+            assert tracker.session.records[-1].same_as == last
+
+
 class Counted(list[FrameRecord]):
     """How often one was looked at."""
 
