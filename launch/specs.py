@@ -11,6 +11,7 @@ from launch.graph import Edge, Graph
 from launch.placement import niceness
 from launch.ports import free_ports
 from launch.refusal import GraphError
+from msgs.codec import array_specs
 from nodes.runtime.addresses import TransportError, is_loopback, load_keys
 
 
@@ -81,8 +82,11 @@ def spec(
             {
                 "type": kind, "address": address[topic_of(edge)], "readers": 0, "observers": [],
                 "patience": settings.supervise.dead if slot.placement.external else 0.0, "away": 0.0,
+                # what it lacks the next image makes up for, as no map does for the last one
+                "live": settings.transport == "tcp" and "image" in array_specs(edge.message),
             },
         )  # fmt: skip
+        output["live"] &= edge.best_effort
         if returns(graph, edge.reader) and not edge.best_effort:
             output["away"] = away
         if edge.reader in graph.observers or edge.reader in graph.sources:  # a source that has ended is not missed
@@ -109,6 +113,7 @@ def spec(
         ],
         "outputs": list(outputs.values()),
         "buffer": settings.buffer,
+        "dead": settings.supervise.dead,
         "seed": settings.seed,
         "threads": threads,
         "cpu": slot.placement.cpu,

@@ -40,6 +40,7 @@ _PREFIX = struct.Struct("<c3sBBHI")  # delivery, magic, version, length of the n
 _MAGIC = b"MVS"
 _HEADER_KEYS = {"sequence", "scalars", "arrays"}
 _ORDER_KEY = "before"  # left out where it says nothing: programs that know no other topic need not send it
+_BEGUN_KEY = "begun"  # as well: most processes are not started again
 _IMAGE_SIZES = frozenset("HWhw")  # named sizes that may not be 0
 
 
@@ -55,6 +56,7 @@ class Decoded(NamedTuple):
     message: msgs.Message
     sequence: int  # position of the message in its topic, from 0
     before: Mapping[str, int] = types.MappingProxyType({})  # messages that its sender had sent of its other types
+    begun: int = 0  # when its sender's process began, ns since 1970 by that host's clock; 0: it is not said
 
 
 @dataclass(frozen=True)
@@ -79,13 +81,14 @@ def encode(
     sequence: int = 0,
     *,
     before: Mapping[str, int] | None = None,
+    begun: int = 0,
     delivery: bytes = RELIABLE,
     allocate: Callable[[int], np.ndarray] = _allocate,
 ) -> memoryview:
     """The message as one frame, in memory of which `allocate(n)` gives at least n bytes (uint8, contiguous).
 
     before: how many messages of each other type the sender has sent so far, by which a reader of several of its topics
-    keeps their order.
+    keeps their order; begun: when the sender's process began, by which a reader knows one that was started again.
     Raises CodecError where a field differs from its annotation or the frame would be larger than `max_message_bytes`
     of its type.
     """
@@ -105,6 +108,8 @@ def encode(
     content: dict[str, Any] = {"sequence": sequence, "scalars": scalars, "arrays": arrays}
     if before:
         content[_ORDER_KEY] = dict(before)
+    if begun:
+        content[_BEGUN_KEY] = begun
     try:
         header = msgpack.packb(content)
     except (ValueError, OverflowError, TypeError) as error:
@@ -154,7 +159,7 @@ def decode(frame: Any, *, expect: tuple[type, ...] | None = None) -> Decoded:
     max_bytes = max_message_bytes(message_type)
     if view.nbytes > max_bytes:
         raise CodecError(f"a frame of {view.nbytes} bytes, more than the {max_bytes} that a {name} may have")
-    sequence, scalars, arrays, before = _unpack_header(header, name)
+    sequence, scalars, arrays, before, begun = _unpack_header(header, name)
     specs = _SPECS[name]
     scalars = {**{field: value for field, value in _DEFAULTS[name].items() if field not in arrays}, **scalars}
     if len(scalars) + len(arrays) != len(specs) or (scalars.keys() | arrays.keys()) != specs.keys():
@@ -179,7 +184,7 @@ def decode(frame: Any, *, expect: tuple[type, ...] | None = None) -> Decoded:
             end = max(end, view.nbytes - section.nbytes + stop)
     if view.nbytes != end:
         raise CodecError(f"the frame of a {name} has {view.nbytes} bytes, its content ends at {end}")
-    return Decoded(message_type(**built), sequence, before)
+    return Decoded(message_type(**built), sequence, before, begun)
 
 
 def type_name(frame: Any) -> str:
@@ -252,12 +257,12 @@ def _split(view: memoryview) -> tuple[str, memoryview]:
     return name, view[start : start + header_length]
 
 
-def _unpack_header(header: memoryview, name: str) -> tuple[int, dict[str, Any], dict[str, Any], dict[str, int]]:
+def _unpack_header(header: memoryview, name: str) -> tuple[int, dict[str, Any], dict[str, Any], dict[str, int], int]:
     try:
         content = unpack(header, MAX_END_VALUES if name == "End" else MAX_VALUES)
     except ValueError as error:
         raise CodecError(f"{name}: the header is no valid msgpack: {error}") from None
-    if not isinstance(content, dict) or content.keys() - {_ORDER_KEY} != _HEADER_KEYS:
+    if not isinstance(content, dict) or content.keys() - {_ORDER_KEY, _BEGUN_KEY} != _HEADER_KEYS:
         raise CodecError(f"{name}: the header must be a map of sequence, scalars and arrays")
     sequence, scalars, arrays = content["sequence"], content["scalars"], content["arrays"]
     if not _is_count(sequence):
@@ -265,9 +270,12 @@ def _unpack_header(header: memoryview, name: str) -> tuple[int, dict[str, Any], 
     before = content.get(_ORDER_KEY, {})
     if not isinstance(before, dict) or not all(t in msgs.TYPES and _is_count(n) for t, n in before.items()):
         raise CodecError(f"{name}: before must be a map of message types to integers from 0")
+    begun = content.get(_BEGUN_KEY, 0)
+    if not _is_count(begun):
+        raise CodecError(f"{name}: begun must be an integer from 0")
     if not isinstance(scalars, dict) or not isinstance(arrays, dict):
         raise CodecError(f"{name}: scalars and arrays must be maps")
-    return sequence, scalars, arrays, before
+    return sequence, scalars, arrays, before, begun
 
 
 def _is_count(value: Any) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,6 +22,7 @@ from nodes.map_page import MapPage, check_address, escaped
 from nodes.page_guard import check_names
 from nodes.seen_keyframes import SeenKeyframe, SeenKeyframes
 
+POLL = 0.25  # s between two looks at whether to stop, while the page is kept open
 _FIGURES = ("nothing", "coverage", "error")  # that can color keyframes
 
 
@@ -154,9 +156,15 @@ class Viewer(Node):
             self._status.content = f"{self._shown}: {self._ending()}"
             logging.info("the run is over; %s stays open until its button Close is pressed", self.url)
             self.stats.values["kept_open"] = True  # the launcher waits for nothing else
-            self.closed.wait()
+            self._await_closing()
         self.server.stop()
         yield from ()
+
+    def _await_closing(self) -> None:
+        """Until the page is closed there, or by Ctrl-C: where all nodes are one process that is a KeyboardInterrupt."""
+        with suppress(KeyboardInterrupt):
+            while not self.closed.wait(POLL):
+                self.rest()
 
     def choose(self, place: int) -> None:
         """Shows the keyframe at this place of the slider, from 0, instead of the newest."""

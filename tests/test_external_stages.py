@@ -221,7 +221,7 @@ def test_a_sender_of_the_newest_that_is_gone_after_its_end_is_not_lost(tmp_path:
         publisher.end(End())
         until(publisher.gone)
         publisher.close()
-        until(lambda: watched(reader).broke)
+        until(lambda: watched(reader)._lost_at is not None)
         time.sleep(2 * PEER_GRACE)
         reader.check_peer()
         assert isinstance(reader.receive(LONG), End)

@@ -54,7 +54,8 @@ def with_bytes_at(place: tuple[Any, ...], header_bytes: bytes, original: bytes =
 @pytest.mark.parametrize(
     "place",
     [("arrays", "image", 0), ("arrays", "image", 1), ("arrays", "image", 2), ("arrays", "image", 1, 0),
-     ("arrays", "image"), ("scalars", "index"), ("scalars",), ("sequence",), ("before",), ("arrays",)],
+     ("arrays", "image"), ("scalars", "index"), ("scalars",), ("sequence",), ("before",), ("begun",),
+     ("arrays",)],
     ids=str,
 )  # fmt: skip
 def test_lists_in_lists_anywhere(place: tuple[Any, ...], levels: int) -> None:

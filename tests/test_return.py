@@ -13,7 +13,7 @@ import pytest
 from msgs import End, Frame, Keyframe, Message, Poses
 from mvsgs_core.stats import Stats
 from nodes.once import Once
-from nodes.runtime.addresses import PeerLost
+from nodes.runtime.addresses import PeerLost, TransportError
 from nodes.runtime.inbox import Inbox
 from nodes.runtime.transport import Publisher, ReliableReader, create_keys, kept
 from nodes.runtime.transport.kept import Kept
@@ -174,14 +174,14 @@ def test_a_sender_that_is_started_again_begins_anew_and_keeps_the_order_of_its_t
     ]
     inbox = Inbox(readers, [])
 
-    def start() -> tuple[Publisher, Publisher]:
-        ends = opened(Publisher(addresses[0])), opened(Publisher(addresses[1]))
+    def start(begun: int) -> tuple[Publisher, Publisher]:
+        ends = opened(Publisher(addresses[0], begun=begun)), opened(Publisher(addresses[1], begun=begun))
         for end in ends:
             until(lambda: ready(end, inbox))  # noqa: B023
             end.start()
         return ends
 
-    keyframes, corrections = start()
+    keyframes, corrections = start(1)
     for n in range(4):
         corrections.send(poses(n + 1, n), {"Keyframe": n})
         keyframes.send(keyframe(n), {"Poses": n + 1})
@@ -189,14 +189,52 @@ def test_a_sender_that_is_started_again_begins_anew_and_keeps_the_order_of_its_t
     keyframes.close()
     corrections.close()
     time.sleep(0.8)  # longer than a lost sender without a return is given
-    keyframes, corrections = start()
+    keyframes, corrections = start(2)
     keyframes.send(keyframe(3), {"Poses": 1})
     corrections.send(poses(4, 3))
     keyframes.send(keyframe(4), {"Poses": 1})
     second = taken(inbox, 4)
     order = [(type(message).__name__, getattr(message, "index", None)) for message in (*first, *second)]
     assert [kind for kind, _ in order] == ["Poses", "Keyframe"] * 4 + ["Poses", "Keyframe", "Keyframe"]
-    assert [reader.begun for reader in readers] == [1, 1]
+    assert [reader.begun for reader in readers] == [2, 2]
+
+
+def test_a_topic_that_was_silent_between_two_restarts_holds_no_other_one_up(tmp_path: Path, opened: Callable) -> None:
+    addresses = f"ipc://{tmp_path}/k", f"ipc://{tmp_path}/p"
+    readers = [
+        opened(ReliableReader(address, kind, topic=f"tracker.{kind.__name__}", away=AWAY))
+        for address, kind in zip(addresses, (Keyframe, Poses), strict=True)
+    ]
+    inbox, found = Inbox(readers, []), list[Message]()
+    for begun in (1, 2, 3):
+        keyframes, corrections = (opened(Publisher(address, begun=begun)) for address in addresses)
+        for end in (keyframes, corrections):
+            until(lambda end=end: ready(end, inbox))
+            end.start()
+        keyframes.send(keyframe(begun))
+        if begun == 3:
+            corrections.send(poses(1, 3), {"Keyframe": 1})
+            keyframes.send(keyframe(4), {"Poses": 1})
+        found += taken(inbox, 3 if begun == 3 else 1)
+        keyframes.close(farewell=False)
+        corrections.close(farewell=False)
+    assert [getattr(message, "index", None) for message in found if isinstance(message, Keyframe)] == [1, 2, 3, 4]
+    assert [type(message).__name__ for message in found][-3:] == ["Keyframe", "Poses", "Keyframe"]
+
+
+def test_a_sender_that_counts_anew_and_is_no_other_process_has_lost_messages(tmp_path: Path, opened: Callable) -> None:
+    address = f"ipc://{tmp_path}/s"
+    reader: ReliableReader = opened(ReliableReader(address, Frame, away=AWAY))
+    inbox = Inbox([reader], [])
+    publisher: Publisher = opened(Publisher(address, begun=7))
+    until(lambda: ready(publisher, inbox))
+    publisher.send(frame(0))
+    publisher.send(frame(1))
+    assert indices(taken(inbox, 2)) == [0, 1]
+    publisher.sent = 0
+    publisher.send(frame(2))
+    with pytest.raises(TransportError, match="message 0 came where 2 was due"):
+        taken(inbox, 1)
 
 
 def test_what_came_already_is_told_and_so_is_what_never_came() -> None:

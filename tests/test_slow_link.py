@@ -1,12 +1,16 @@
-"""A robot whose reader, or the link to it, is slower than its frames: the newest come, and nobody holds it back. A link
-that is only long costs none."""
+"""A sender whose reader, or the link to it, is slower than its messages: the newest come, and nobody holds it back. A
+link that is only long costs none, and what is sent last comes over any."""
 
 from __future__ import annotations
 
 import shutil
+import socket
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,15 +18,20 @@ import numpy as np
 import pytest
 import zmq
 
-from msgs import Frame
+from launch.compose import compose
+from launch.specs import addresses, spec
+from msgs import End, Frame, SplatMap
 from msgs.codec import NEWEST, RELIABLE, decode
 from mvsgs_core.stats import Stats
 from nodes import stream_frames
-from nodes.runtime.transport import LivePublisher
+from nodes.runtime.addresses import Keys
+from nodes.runtime.transport import LivePublisher, NewestReader, Publisher, create_keys, publisher
 from nodes.stream_frames import StreamFrames
 from tests.support import long_link
-from tests.support.patience import LONG, until
-from tests.support.ports import tcp_address
+from tests.support.example_messages import example
+from tests.support.patience import LONG, Stopwatch, until
+from tests.support.ports import free_port, tcp_address
+from tests.support.processes import graph
 from tests.support.shared_data import ROOT
 
 COUNT = 40  # frames of nearly a megabyte
@@ -55,6 +64,139 @@ def test_few_old_frames_wait_for_a_reader_that_is_behind() -> None:
             waiting.append(message.index)
     publisher.close()
     assert 1 <= len(waiting) <= 6, waiting  # two at either end, and what is on its way
+
+
+@pytest.mark.slow
+def test_few_old_frames_of_a_node_wait_for_a_reader_of_the_newest_that_is_behind() -> None:
+    with graph(buffer=128, ports=[free_port()]) as g, subscribed(g.address("source.Frame"), NEWEST) as reader:
+        frames = {"type": "Frame", "address": g.address("source.Frame"), "readers": 1, "live": True}
+        source = g.start(
+            "source", "tests.support.sample_nodes.Source", {}, {}, {"count": COUNT, "delay": 0.005}, outputs=[frames]
+        )
+        source.wait_for(lambda status: status.get("state") == "ending")
+        waiting = []
+        while reader.poll(1000) and not isinstance(message := decode(reader.recv()).message, End):
+            assert isinstance(message, Frame)
+            waiting.append(message.index)
+        assert 1 <= len(waiting) <= 6, waiting
+
+
+@pytest.mark.parametrize(
+    ("words", "live"),
+    [
+        (["transport=tcp"], ["dataset.Frame", "mapper.Preview"]),
+        (["transport=tcp", "recorder=mcap"], ["dataset.Frame", "mapper.Preview"]),
+        (["transport=tcp", "dataset.best_effort=[]", "realtime=false"], ["mapper.Preview"]),
+        ([], []),  # no link is between the processes of one host
+    ],
+    ids=lambda given: " ".join(given) or "none",
+)
+def test_images_that_only_the_newest_is_read_of_are_sent_so_over_tcp(
+    words: list[str], live: list[str], tmp_path: Path
+) -> None:
+    """But the last map, or what the tracker does last, comes however much there was before it."""
+    found = compose(["dataset=robot", "dataset.path=tcp://127.0.0.1:5555", "viewer=viser", *words])
+    at = addresses(found, tmp_path)
+    outputs = {
+        f"{name}.{output['type']}": output["live"]
+        for name in found.slots
+        for output in spec(found, name, at, None, None)["outputs"]
+    }
+    assert sorted(topic for topic, sent in outputs.items() if sent) == live
+
+
+@contextmanager
+def slow_link(to: int, rate: float) -> Iterator[int]:
+    """A port from which one connection goes on to the other one, `rate` bytes a second back."""
+    with ExitStack() as opened:
+        server = opened.enter_context(socket.create_server(("127.0.0.1", 0)))
+
+        def carry() -> None:
+            reader = opened.enter_context(server.accept()[0])
+            sender = opened.enter_context(socket.socket())
+            sender.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2**16)
+            sender.connect(("127.0.0.1", to))
+
+            def there() -> None:
+                with suppress(OSError):
+                    while data := reader.recv(4096):
+                        sender.sendall(data)
+
+            threading.Thread(target=there, daemon=True).start()
+            with suppress(OSError):
+                while data := sender.recv(2**14):
+                    reader.sendall(data)
+                    time.sleep(len(data) / rate)
+                reader.shutdown(socket.SHUT_RDWR)
+
+        threading.Thread(target=carry, daemon=True).start()
+        yield server.getsockname()[1]
+
+
+def large_map(megabytes: int) -> SplatMap:
+    count = megabytes * 2**20 // 192
+    small = example(SplatMap)
+    assert isinstance(small, SplatMap)
+    of_splats = ("means", "log_scales", "quaternions", "opacity_logits", "betas", "anchors")
+    arrays = {
+        name: np.zeros((count, *getattr(small, name).shape[1:]), getattr(small, name).dtype) for name in of_splats
+    }
+    return replace(small, sh=np.zeros((count, 11, 3), np.float32), **arrays)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("with_keys", [False, True])
+def test_a_last_map_that_takes_longer_than_a_goodbye_still_arrives(
+    with_keys: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(publisher, "NEWEST_GOODBYE", 0.3)
+    keys = create_keys(tmp_path) if with_keys else None
+    port, watch = free_port(), Stopwatch()
+    with slow_link(port, 10e6) as there, end_of_a_topic(port, keys) as sender:
+        reader = NewestReader(f"tcp://127.0.0.1:{there}", SplatMap, keys=keys)
+        with closing(reader):
+            until(lambda: sender.ready(1))
+            sender.start()
+            sender.send(large_map(16))
+            sender.end(End())
+            until(sender.gone)
+            sender.close(farewell=False)
+            assert isinstance(reader.receive(LONG), SplatMap)
+            assert isinstance(reader.receive(LONG), End)
+    assert not watch.within(1.0), "the link is slow"
+
+
+@contextmanager
+def end_of_a_topic(port: int, keys: Keys | None = None, **options: float) -> Iterator[Publisher]:
+    sender = Publisher(f"tcp://127.0.0.1:{port}", keys=keys, buffer=4, **options)
+    try:
+        yield sender
+    finally:
+        sender.close(farewell=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("sent", "dead", "seconds"), [(lambda: frame(0), LONG, 0.3), (lambda: large_map(16), 1.0, 1.0)]
+)
+def test_a_reader_that_hangs_is_not_waited_for_without_end(
+    sent: Callable[[], Frame | SplatMap], dead: float, seconds: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(publisher, "NEWEST_GOODBYE", 0.3)
+    port = free_port()
+    with (
+        slow_link(port, 1e5) as there,
+        end_of_a_topic(port, dead=dead) as sender,
+        subscribed(f"tcp://127.0.0.1:{there}", NEWEST),
+    ):
+        until(lambda: sender.ready(1))
+        sender.start()
+        sender.send(sent())
+        sender.end(End())
+        watch = Stopwatch()
+        until(sender.gone)
+        assert not watch.within(seconds)
+        assert watch.within(seconds + 10.0)
 
 
 def over_a_long_link(folder: Path, program: str) -> subprocess.CompletedProcess[str]:

@@ -25,6 +25,7 @@ from mvsgs_core.photometry import vignetting_factor
 from mvsgs_core.rasterizer.interface import as_bytes
 from mvsgs_core.rasterizer.kernels import gaussian_std_ratio
 from nodes import handlers, outputs
+from nodes.runtime.signals import Stopped
 from nodes.splat_map import splat_map
 from nodes.viewer import Viewer
 from tests.support.ports import free_port
@@ -363,3 +364,25 @@ def test_ends_with_the_run_unless_kept_open() -> None:
     kept.closed.set()
     ending.join(timeout=15)
     assert not ending.is_alive()
+
+
+def test_ctrl_c_closes_a_kept_page_in_a_run_of_one_process() -> None:
+    kept = Viewer(Viewer.Config(port=free_port(), keep_open=True))
+    ctrl_c = threading.Timer(0.5, lambda: os.kill(os.getpid(), signal.SIGINT))
+    ctrl_c.start()
+    assert list(kept.on_end()) == []
+    ctrl_c.join()
+    with pytest.raises(OSError):
+        urllib.request.urlopen(kept.url, timeout=2)
+
+
+def test_a_viewer_that_is_told_to_stop_stops_while_its_page_is_kept_open() -> None:
+    kept = Viewer(Viewer.Config(port=free_port(), keep_open=True))
+
+    def stop() -> None:
+        raise Stopped(signal.SIGINT)
+
+    kept.rest = stop
+    with pytest.raises(Stopped):
+        list(kept.on_end())
+    kept.server.stop()

@@ -35,7 +35,7 @@ from nodes.runtime.runner import Runner, end_of, exit_fails, seed, stats_of
 from nodes.runtime.signals import ABORT_SECONDS, Signals, Stopped, end_within
 from nodes.runtime.spec import Input, Spec
 from nodes.runtime.status import Status, peak_bytes
-from nodes.runtime.transport import NewestReader, Publisher, ReliableReader, shut_down
+from nodes.runtime.transport import LivePublisher, NewestReader, Publisher, ReliableReader, shut_down
 
 POLL = 0.25  # s between looks at signals and lost peers while nothing arrives
 STOP_GRACE = 2.0  # s that a source's current item may take after SIGINT
@@ -192,12 +192,14 @@ class _Process:
         """Readers first: the nodes upstream wait for them, whoever waits here for others."""
         spec = self._spec
         self._read([i for i in spec.inputs if not _of_a_camera(i)])
+        begun = time.time_ns() if spec.returns else 0
         for o in spec.outputs:
             topic = f"{spec.name}.{o.type}"
-            self._publishers[o.type] = Publisher(
-                o.address, topic=topic, buffer=spec.buffer, held_back=partial(self._held_back, topic), away=o.away,
-                **self._shared,
-            )  # fmt: skip
+            options = self._shared | {"topic": topic, "held_back": partial(self._held_back, topic), "dead": spec.dead}
+            if o.live:
+                self._publishers[o.type] = LivePublisher(o.address, **options)
+            else:
+                self._publishers[o.type] = Publisher(o.address, buffer=spec.buffer, away=o.away, begun=begun, **options)
         return self._inbox()
 
     def _open_frames(self) -> Inbox:

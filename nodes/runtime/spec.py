@@ -4,9 +4,9 @@
      "inputs": [{"type": "Keyframe", "slot": "tracker", "address": "ipc:///tmp/x/tracker.Keyframe",
                  "best_effort": false, "away": 0.0}],
      "outputs": [{"type": "Depth", "address": "ipc:///tmp/x/mvs.Depth", "readers": 1, "observers": [], "patience": 0.0,
-                  "away": 0.0}],
-     "observer": false, "returns": false, "buffer": 4, "seed": 0, "threads": 1, "cpu": null, "nice": 0, "keys": null,
-     "token": "", "status_fd": null}
+                  "away": 0.0, "live": false}],
+     "observer": false, "returns": false, "buffer": 4, "dead": 60.0, "seed": 0, "threads": 1, "cpu": null, "nice": 0,
+     "keys": null, "token": "", "status_fd": null}
 
 `readers` counts those of both kinds without observers, which are named; `buffer` is in messages; `keys` is a folder,
 see `addresses.load_keys`; `token` is a secret of the run, without which a publisher takes nobody for a reader. A
@@ -47,6 +47,7 @@ class Output:
     observers: tuple[str, ...] = ()
     patience: float = 0.0  # s for which these are waited for once all others are there; 0: until they are gone
     away: float = 0.0  # s for which a reader is waited for, once it is lost
+    live: bool = False  # the newest is all that anybody reads, over a link that may be slower: few old ones may wait
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,7 @@ class Spec:
     observer: bool = False  # nobody who makes the map depends on this node
     returns: bool = False  # it may be started again in the midst of a run
     buffer: int = 4  # messages
+    dead: float = 60.0  # s for which a reader of the newest only may take to read the last message
     seed: int = 0
     threads: int | None = None  # None: all cores of this host
     cpu: tuple[int, ...] | None = None  # cores; None: all

@@ -99,7 +99,8 @@ class LiveReader(NewestReader):
 
 
 class LivePublisher(Publisher):
-    """A topic that programs elsewhere read; `refused` says how many of them were turned away.
+    """A topic of the newest only, for programs elsewhere or, over tcp, a graph's; `refused` says how many readers were
+    turned away.
 
     No reader holds it back, so that only readers of the newest are served. Over a link that is slower than the stream
     new messages are dropped while old ones wait: as few wait as can.

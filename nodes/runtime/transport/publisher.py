@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -28,7 +28,7 @@ from nodes.runtime.transport.sockets import (
 )
 
 MAX_SUBSCRIPTION_BYTES = 64 * 2**10  # of what a reader may send: one byte, and the handshake
-NEWEST_GOODBYE = 3.0  # s that a best-effort reader has to take its End
+NEWEST_GOODBYE = 3.0  # s that a best-effort reader has to take its End, once nothing waits before that
 HELD_BACK_MS = 100  # between two calls of `held_back`
 
 
@@ -55,6 +55,8 @@ class Publisher:
         token: str = "",  # with which a reader's subscription must begin: who has none gets nothing
         held_back: Callable[[], None] = lambda: None,
         away: float = 0.0,  # s for which a lost reader is waited for; 0: it is an error at once
+        dead: float = 60.0,  # s after End for which a best-effort reader is waited for at most
+        begun: int = 0,  # when this process began, ns since 1970, where it may be started again within a run; else 0
         say: Callable[[str], object] = lambda text: None,  # takes what a user should read
     ) -> None:
         check_address(address, bind=True, keys=keys)
@@ -65,11 +67,13 @@ class Publisher:
         self.observers: dict[str, bytes] = {}  # delivery of those readers that only observe, by name
         self._essential = 0  # reliable readers that were there at the start
         self._held_back = held_back
-        self._buffer, self._away, self._say = max(1, buffer), away, say
+        self._buffer, self._away, self._dead, self._say = max(1, buffer), away, dead, say
+        self._begun = begun
         self._kept = Kept(self._buffer) if away else None
         self._missing_since: float | None = None  # by time.monotonic: when a reader was lost that is not back
         self._not_sent = 0  # messages that a lost reader will get when it is back
         self._goodbyes = 0
+        self._newest: deque[zmq.MessageTracker] = deque(maxlen=2)  # the last message to best-effort readers, and End
         self._started = self._ended = False
         self._pool = FramePool()
         self._keys = keys
@@ -172,25 +176,32 @@ class Publisher:
             self.watch()
         sequence = self.sent
         if self.readers[NEWEST] > 0:
-            self._send(message, sequence, NEWEST, before)
+            self._newest.append(self._send(message, sequence, NEWEST, before))
         if self.readers[RELIABLE] > 0:
             self._send(message, sequence, RELIABLE, before)
         elif self._kept is not None:
-            self._kept.add(encode(message, sequence, before=before, delivery=RELIABLE))
+            self._kept.add(encode(message, sequence, before=before, begun=self._begun, delivery=RELIABLE))
         self.sent = sequence + 1  # not by a message that cannot be encoded: readers would miss it
         self._not_sent += 1
 
     def end(self, message: End) -> None:
         self._ended = True
         self.send(message)
-        self._end, self._deadline = message, time.monotonic() + NEWEST_GOODBYE
+        self._end, self._end_at = message, time.monotonic()
+        self._deadline = self._end_at + NEWEST_GOODBYE
 
     def gone(self) -> bool:
-        """After `end`: whether all readers have said goodbye."""
+        """After `end`, to be asked several times a second: whether all readers have said goodbye.
+
+        A best-effort one is waited for while the last message is on its way to it, and for a short time after that.
+        """
         self.watch()
-        late = time.monotonic() > self._deadline
-        if self.readers[NEWEST] > 0 and not late:
-            self._send(self._end, self.sent - 1, NEWEST)
+        now = time.monotonic()
+        if not all(sent.done for sent in self._newest):
+            self._deadline = min(now + NEWEST_GOODBYE, self._end_at + self._dead)
+        elif self.readers[NEWEST] > 0 and now <= self._deadline:
+            self._newest.append(self._send(self._end, self.sent - 1, NEWEST))
+        late = now > self._deadline
         there = self.readers[RELIABLE] > 0 or (self._away > 0 and self._missing() > 0)
         return not there and (late or self.readers[NEWEST] <= 0)
 
@@ -211,21 +222,26 @@ class Publisher:
         if self._keys is not None:
             guard.leave(self._keys)
 
-    def _send(self, message: Message, sequence: int, delivery: bytes, before: Mapping[str, int] | None = None) -> None:
+    def _send(
+        self, message: Message, sequence: int, delivery: bytes, before: Mapping[str, int] | None = None
+    ) -> zmq.MessageTracker:
         buffers: list[np.ndarray] = []
 
         def allocate(size: int) -> np.ndarray:
             buffers.append(self._pool.take(size))
             return buffers[0]
 
-        frame = encode(message, sequence, before=before, delivery=delivery, allocate=allocate)
+        frame = encode(message, sequence, before=before, begun=self._begun, delivery=delivery, allocate=allocate)
         if self._kept is not None and delivery == RELIABLE:
             self._kept.add(frame)
-        self._pool.give(buffers[0], self._deliver(frame, delivery != NEWEST))
+        tracker = self._deliver(frame, delivery != NEWEST)
+        self._pool.give(buffers[0], tracker)
+        return tracker
 
     def _deliver(self, frame: memoryview | bytes, reliably: bool) -> zmq.MessageTracker:
         self.socket.setsockopt(zmq.XPUB_NODROP, int(reliably))
-        whole = zmq.Frame(frame, track=True, copy=None, copy_threshold=self.socket.copy_threshold)
+        copy = False if self._ended else None  # of a copy nobody is told when it has left, and of End it matters
+        whole = zmq.Frame(frame, track=True, copy=copy, copy_threshold=self.socket.copy_threshold)
         while True:
             try:
                 return self.socket.send(whole, copy=False, track=True)

@@ -66,7 +66,6 @@ class _Reader:
         self._lost_at: float | None = None
         self._away, self._say = away, say
         self._token, self._observer = token.encode(), observer
-        self.broke = False  # the connection did, and nothing came since
         self._met = False  # the publisher let this reader in once
         self._socket = open_socket(zmq.SUB, address, keys, max_message_bytes(type))
         self._socket.rcvhwm = self._buffer
@@ -102,7 +101,7 @@ class _Reader:
                     self._say(f"the publisher of {self.topic} is back after {time.monotonic() - self._lost_at:.1f} s")
                     self._lost_at = None
             elif self._lost_at is None:
-                self._lost_at, self.broke = time.monotonic(), True
+                self._lost_at = time.monotonic()
                 if self._away and not self.ended:
                     self._say(f"the publisher of {self.topic} was lost: it is waited for up to {self._away:g} s")
 
@@ -185,7 +184,7 @@ class ReliableReader(_Reader):
 
     def __init__(self, address: str, type: type, *, joins: bool = False, **options: Any) -> None:
         super().__init__(address, type, **options)
-        self.begun = 0  # times that the publisher was started again and its stream came from the beginning
+        self.begun = 0  # when the sender's process began, as its newest message says, ns since 1970
         self._joining = joins
         if joins:
             self._socket.subscribe(AGAIN)  # for this socket's own filter: to the publisher it says nothing
@@ -210,8 +209,10 @@ class ReliableReader(_Reader):
             self._frames.append(self._socket.recv(copy=False))
         if self._head is None and self._frames and not self.ended:
             self._head = self._decode(self._frames.popleft())
-            if self._begins(self._head.sequence):
-                self.expected = self._head.sequence
+            if self._away and self._head.begun != self.begun:
+                self.begun, self.expected = self._head.begun, 0
+            if self._joining:
+                self._joining, self.expected = False, self._head.sequence
             if self._head.sequence != self.expected:
                 raise TransportError(
                     f"{self.topic}: message {self._head.sequence} came where {self.expected} was due: some were lost"
@@ -219,21 +220,10 @@ class ReliableReader(_Reader):
         return self._head
 
     def behind(self, begun: int, messages: int) -> bool:
-        """Whether some of that many messages are still to come, of a sender that was started again `begun` times."""
+        """Whether some of that many messages are still to come, of a sender whose process began then."""
         if self.begun != begun:
             return self.begun < begun and messages > 0
         return messages > self.expected
-
-    def _begins(self, sequence: int) -> bool:
-        """Whether another numbering holds from this message on."""
-        joining, self._joining = self._joining, False
-        if self._away and sequence == 0:
-            self.watch()
-            if self.broke:
-                self.broke = False
-                self.begun += 1
-                return True
-        return joining
 
     def take(self) -> Message | None:
         """The next message, if one has arrived; after End nothing. Raises TransportError if one was lost."""
@@ -297,7 +287,7 @@ class NewestReader(_Reader):
             frame = self._odd.popleft()
         if frame is None or self.ended:
             return None
-        message, sequence, _ = self._decode(frame)
+        message, sequence, *_ = self._decode(frame)
         self._count(message)
         self._note(sequence)
         return message
