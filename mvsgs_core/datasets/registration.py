@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from mvsgs_core.camera import project, unproject
 from mvsgs_core.datasets.framing import same_shape
 from mvsgs_core.datasets.lens import Lens, distorted
 
@@ -12,17 +11,19 @@ from mvsgs_core.datasets.lens import Lens, distorted
 def register(depth: np.ndarray, source: Lens, target: Lens, baseline: float) -> np.ndarray:
     """Depth map (H, W) float32 as a camera `baseline` to the right of its own sees it, through its lens, at the lens's
     size; the nearest surface wins."""
-    height, width = target.size
-    v, u = np.nonzero(depth)
-    z = depth[v, u]
-    points = unproject(depth, np.array(source.intrinsics))[v, u] - (baseline, 0.0, 0.0)
-    pixels = project(points, np.array(target.intrinsics))
-    if target.distorted and len(pixels):
-        pixels = distorted(target, np.array(target.intrinsics), pixels)
-    pixels = np.rint(pixels).astype(np.int64)
-    inside = np.all((pixels >= 0) & (pixels < (width, height)), axis=1)
+    (height, width), (fx, fy, cx, cy) = target.size, target.intrinsics
+    rows, columns = np.nonzero(depth)
+    z = depth[rows, columns]
+    own_fx, own_fy, own_cx, own_cy = source.intrinsics
+    x, y = (np.arange(depth.shape[1]) - own_cx) / own_fx, (np.arange(depth.shape[0]) - own_cy) / own_fy
+    u = fx * (x[columns] - baseline / z.astype(np.float64)) + cx
+    v = fy * y[rows] + cy
+    if target.distorted and len(z):
+        u, v = distorted(target, np.array(target.intrinsics), np.stack([u, v], axis=1)).T
+    u, v = np.rint(u).astype(np.int64), np.rint(v).astype(np.int64)
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     result = np.full(height * width, np.inf, dtype=np.float32)
-    np.minimum.at(result, pixels[inside, 1] * width + pixels[inside, 0], z[inside])
+    np.minimum.at(result, (v * width + u)[inside], z[inside])
     result[np.isinf(result)] = 0.0
     return result.reshape(height, width)
 
