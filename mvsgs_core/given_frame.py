@@ -56,13 +56,8 @@ def given_frame(world_from_cam: np.ndarray, given: np.ndarray) -> GivenFrame:
             "forward), not of what carries it"
         )
     axes, given_axes = (np.swapaxes(poses[:, :3, :3], 1, 2) for poses in (world_from_cam, given))  # (N, axis, 3)
-    rotation = geometry.nearest_rotation(np.einsum("nai,naj->ij", given_axes, axes))
-    centered, moved = target - target.mean(axis=0), (source - source.mean(axis=0)) @ rotation.T
-    scale = float(np.sum(centered * moved) / np.sum(moved**2))
-    if scale <= 0.0:
-        raise NoFrameError("they go another way than the camera")
-    found = Similarity(scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0))
-    extent = float(np.linalg.norm(centered, axis=1).max())
+    found, away = geometry.umeyama(source, target), np.linalg.norm(target - target.mean(axis=0), axis=1)
+    extent = float(away.max())
     for _ in range(ROUNDS):
         off, angles = _differences(found, world_from_cam, given)
         usual = float(np.sqrt(np.mean(angles**2)))
@@ -74,7 +69,7 @@ def given_frame(world_from_cam: np.ndarray, given: np.ndarray) -> GivenFrame:
         )
     off, angles = _differences(found, world_from_cam, given)
     distance = float(np.median(off))
-    if distance > OTHER * float(np.median(np.linalg.norm(centered, axis=1))):
+    if distance > OTHER * float(np.median(away)):
         raise NoFrameError(f"they lie {distance:.3g} of their unit from the camera's path, as far as that is long")
     return GivenFrame(found, len(given), distance, float(np.degrees(np.median(angles))))
 
