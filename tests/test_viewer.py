@@ -369,9 +369,13 @@ def test_ends_with_the_run_unless_kept_open() -> None:
 def test_ctrl_c_closes_a_kept_page_in_a_run_of_one_process() -> None:
     kept = Viewer(Viewer.Config(port=free_port(), keep_open=True))
     ctrl_c = threading.Timer(0.5, lambda: os.kill(os.getpid(), signal.SIGINT))
-    ctrl_c.start()
-    assert list(kept.on_end()) == []
-    ctrl_c.join()
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background it is ignored
+    try:
+        ctrl_c.start()
+        assert list(kept.on_end()) == []
+        ctrl_c.join()
+    finally:
+        signal.signal(signal.SIGINT, before)
     with pytest.raises(OSError):
         urllib.request.urlopen(kept.url, timeout=2)
 

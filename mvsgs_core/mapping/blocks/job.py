@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -106,9 +106,11 @@ def job_of(mapper: OnlineMapper, parting: Parting, block: int, iterations: int, 
     images: dict[str, np.ndarray] = {}
     names = [_take(view, images) for view in copied.views], [_take(view, images) for view in copied.keyframes.between]
     meta, arrays = pack(copied, "map", *names)
+    at_home = len(trained.intersection(home)) / max(1, len(trained))
     arrays |= {f"photometry/{name}": value for name, value in photometry_arrays(copied.photometry).items()}
     arrays["owned"] = (parting.owner == block)[parting.needed[block]]
-    return Job({"mapper": meta, "refinement": iterations, "last": last, "home": home}, arrays, images)
+    told = {"mapper": meta, "refinement": iterations, "last": last, "home": home, "at_home": at_home}
+    return Job(told, arrays, images)
 
 
 def refined(job: Job, config: MapperConfig) -> Iterator[Result | None]:
@@ -118,6 +120,8 @@ def refined(job: Job, config: MapperConfig) -> Iterator[Result | None]:
     """
     arrays, log = Arrays(job.arrays), Stats()
     photometry = photometry_of(arrays.of("photometry"))
+    control = config.density_control  # what may be lost of a guest's image is its home's
+    config = replace(config, density_control=replace(control, needless=control.needless * job.meta["at_home"]))
 
     def image(name: str) -> tuple[Tensor, Tensor | None]:
         return image_of(job.images[name] if name else NO_IMAGE)

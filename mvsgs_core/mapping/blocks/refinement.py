@@ -13,7 +13,7 @@ from mvsgs_core.mapping.blocks.ray_cluster import ClusterError, RayCluster
 from mvsgs_core.mapping.mapper import OnlineMapper
 
 WORTH = 1.5  # times the iterations of the whole map that blocks of it may take in one process
-TOGETHER = 0.05  # of the iterations, the last, over the whole map
+TOGETHER = 0.2  # of the iterations, the last, over the whole map
 
 
 def refined_in_blocks(mapper: OnlineMapper, total: int) -> Iterator[int] | None:
