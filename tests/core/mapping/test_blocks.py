@@ -224,7 +224,7 @@ def test_a_small_map_is_refined_whole_and_a_large_one_in_blocks() -> None:
     config = replace(atlas.current.config, refinement=6, refine=RefineConfig(keyframes=2, overlap=1.0))
     atlas.current.config = config
     while atlas.refine():
-        assert len(atlas.current.log.values) == 0 or atlas.refined == 6
+        assert len(atlas.current.log.values) == 0 or atlas.refined >= 6 - together(6, 2) == 5
     assert atlas.current.log.values["blocks"] == 2
     assert not atlas.refine()
 
@@ -245,7 +245,7 @@ def test_what_is_cut_off_after_the_blocks_goes_on_in_the_merged_map(tmp_path: Pa
 
     whole, done = in_parts(None)
     blocks = done.count(0)
-    assert done[blocks:] == [38, 39, 40]
+    assert done[blocks:] == list(range(32, 41))
     for cut in (blocks // 2, blocks + 1, blocks + 2):
         again, others = in_parts(cut)
         assert others[cut:] == done[cut if cut > blocks else 0 :]
