@@ -14,6 +14,8 @@ FILES = ("report.html", "report.json", "map.ply", "cameras.json", "transforms.js
          "localization.csv", "comparison.png", "georeference.json", "given_frame.json", "checkpoint",
          "config.yaml", "logs")  # fmt: skip
 
+ROUNDING = 1e-9  # of a pose's unit
+
 
 def summary(output: Path) -> str:
     """What the run reached and where its files are."""
@@ -53,6 +55,12 @@ def _figures(report: Mapping[str, Any]) -> list[str]:
         lines.append(
             f"GPS         {place['residual']:.2f} m from {place['positions']} positions (median), {place['outliers']} "
             f"outliers; sure to {sure}; metres: mvsgs export RUN OUT --frame enu"
+        )
+    given = value(report, "given_frame")
+    if given and given["distance"] > ROUNDING:  # else the map was made of them
+        lines.append(
+            f"given poses {given['distance']:.4g} from the trajectory (median of {given['poses']}), in their unit; the "
+            "map in their frame: mvsgs export RUN OUT --frame given"
         )
     depth = value(report, "depth") or {}
     if errors := metrics.listed(metrics.DEPTH, depth):

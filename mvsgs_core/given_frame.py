@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -98,6 +99,15 @@ def values_of(found: GivenFrame) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def in_words(found: Mapping[str, Any]) -> dict[str, str]:
+    """What a report says of `values_of` a given frame."""
+    return {
+        "given poses: distance to the trajectory, median": f"{found['distance']:.4g} of their unit, of "
+        f"{found['poses']} poses; turned by {found['angle']:.2g} degrees",
+        "given poses: one unit of the map": f"{found['scale']:.4g} of theirs",
+    }
+
+
 def write_given_frame(path: Path, found: GivenFrame) -> None:
     """Replaces `path` atomically. Raises OSError."""
     said = "position as poses were given = scale * rotation * position in map.ply + translation"
@@ -122,4 +132,7 @@ def read_given_frame(path: Path) -> GivenFrame:
         return GivenFrame(place, int(content["poses"]), float(content["distance"]), float(content["angle"]))
 
 
-__all__ = ["FILE", "GivenFrame", "NoFrameError", "given_frame", "read_given_frame", "values_of", "write_given_frame"]
+__all__ = [
+    "FILE", "GivenFrame", "NoFrameError", "given_frame", "in_words", "read_given_frame", "values_of",
+    "write_given_frame",
+]  # fmt: skip

@@ -141,6 +141,7 @@ class Evaluator(Node):
             found = given_frame.given_frame(poses.estimate, poses.truth)
         except NoFrameError as error:
             self.stats.warn(f"the poses that came with the frames do not tell where the map lies: {error}")
+            self.report["given_frame"] = None
             return None
         self.report["given_frame"] = given_frame.values_of(found)
         return found

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from launch.summary import summary
 from msgs import Frame, GroundTruth, Keyframe, Message, Trajectory
 from msgs.codec import NEWEST, encode
 from mvsgs_core.given_frame import read_given_frame
 from nodes.catching_up import PASSED_OVER
 from nodes.posed_tracker import PosedTracker
 from nodes.robot import Robot
-from tests.support.evaluated_wall import ORIGIN, SCALE, feed, poses_along, wall_evaluator
+from tests.support.evaluated_wall import ORIGIN, SCALE, N, feed, poses_along, wall_evaluator
 from tests.support.live_programs import Program
 from tests.support.ports import tcp_address
 from tests.support.sequences import synthetic
@@ -85,6 +87,7 @@ def test_a_file_says_where_a_map_lies_among_the_poses_that_came(tmp_path: Path) 
     report = feed(wall_evaluator(tmp_path))
     found = read_given_frame(tmp_path / "given_frame.json")
     assert report["given_frame"]["scale"] == pytest.approx(1 / SCALE)
+    assert "given poses: distance to the trajectory" in (tmp_path / "report.html").read_text()
     assert (found.poses, found.distance) == (len(poses_along()), pytest.approx(0.0, abs=1e-6))
     true = poses_along()[:, :3, 3] / SCALE
     np.testing.assert_allclose(found.similarity.apply(poses_along()[:, :3, 3] + ORIGIN), true, atol=1e-6)
@@ -95,7 +98,17 @@ def test_poses_of_something_else_tell_no_frame_and_it_is_said(tmp_path: Path) ->
     for pose in node.evaluation.truth.values():
         pose[:3, 3] = 0.0
     report = feed(node)
-    assert "given_frame" not in report
+    assert report["given_frame"] is None
     assert not (tmp_path / "given_frame.json").exists()
     said = "the poses that came with the frames do not tell where the map lies: their positions coincide"
     assert said in report["warnings"]["evaluator"]
+
+
+def test_a_run_ends_with_how_to_have_its_map_among_the_poses_unless_it_was_made_of_them(tmp_path: Path) -> None:
+    report = feed(wall_evaluator(tmp_path))
+    for distance, told in ((0.0056, True), (1e-14, False)):
+        report["given_frame"]["distance"] = distance
+        (tmp_path / "report.json").write_text(json.dumps(report))
+        lines = [line for line in summary(tmp_path).splitlines() if "--frame given" in line]
+        assert len(lines) == told
+        assert all(f"{distance:.4g} from the trajectory (median of {N})" in line for line in lines)

@@ -14,6 +14,7 @@ from mvsgs_core.evaluation import metrics, skipped, svg
 from mvsgs_core.evaluation.origin import in_words
 from mvsgs_core.evaluation.scoring import DepthRange, depth_colors
 from mvsgs_core.georeference import in_words as in_words_of_gps
+from mvsgs_core.given_frame import in_words as in_words_of_given
 
 _FIRST, _WATCHING = ("tracker", "dataset"), ("viewer", "recorder", "publisher", "evaluator")  # slots, by their warnings
 _ENLARGE = "this.parentNode.classList.toggle('large')"
@@ -170,6 +171,7 @@ def page(
     figures = {
         **_metrics("", metrics.TRAJECTORY, trajectory),
         **(in_words_of_gps(report["georeference"]) if report.get("georeference") else {}),
+        **(in_words_of_given(report["given_frame"]) if report.get("given_frame") else {}),
         "keyframes with a true pose": trajectory["ate_keyframes"],
         "frames tracked": f"{trajectory['frames_tracked']} of {trajectory['frames']}{_span(trajectory)}",
         "frames without a pose": _listed(trajectory["frames_without_pose"]) or "none",

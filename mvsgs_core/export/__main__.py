@@ -23,7 +23,7 @@ from mvsgs_core.atomic_file import replacing
 from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.cameras import Cameras, read_source_camera, write_cameras
 from mvsgs_core.export.colmap import write_colmap
-from mvsgs_core.export.command_line import cameras_of_map, input_arguments, read_map, run
+from mvsgs_core.export.command_line import cameras_of_map, input_arguments, known_cameras, read_map, run
 from mvsgs_core.export.image_sizes import check_sizes
 from mvsgs_core.export.mesh import write_mesh
 from mvsgs_core.export.other_frame import FILES, cameras_in_frame, in_axes_of, in_frame, reference_of, told
@@ -171,7 +171,8 @@ def export(options: argparse.Namespace, unset: Callable[[str], object]) -> str:
     found, options.place = reference_of(options), None
     if found is None:
         return f"{out}: {write(out, final.scaled(options.scale), options)}{left_out}"
-    options.place, axes = in_axes_of(out, found, final.world_from_cam)
+    cameras = known_cameras(options)
+    options.place, axes = in_axes_of(out, found, None if cameras is None else cameras.world_from_cam)
     said = write(out, in_frame(final, options.place), options)
     return f"{out}: {said}{left_out}; {told(out, found, axes)}"
 

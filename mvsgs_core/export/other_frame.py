@@ -36,20 +36,22 @@ def reference_of(options: argparse.Namespace) -> Georeference | GivenFrame | Non
     if not path.is_file():
         lacking = "had no GPS" if on_earth else "came without poses"
         raise ValueError(
-            f"there is no {path.name} beside {options.map}: the frames of the run {lacking}, or its report warns why "
-            "that does not tell where the map lies"
+            f"there is no {path.name} beside {options.map}: the frames of the run {lacking}, its report warns why that "
+            "does not tell where the map lies, or it has none (evaluator=off, a run that did not end)"
         )
     return georeference.read_georeference(path) if on_earth else given_frame.read_given_frame(path)
 
 
-def in_axes_of(out: Path, found: Georeference | GivenFrame, cameras: np.ndarray) -> tuple[Similarity, str]:
+def in_axes_of(out: Path, found: Georeference | GivenFrame, cameras: np.ndarray | None) -> tuple[Similarity, str]:
     """Where the map is to be written so that the file has up where its format says, and the file's axes in words.
 
-    cameras: world_from_cam (N, 4, 4) of the map, of which the given frame's up is that of most.
+    cameras: world_from_cam (N, 4, 4) of the map, whose mean up tells that of the given frame; None: it is not known.
     """
     place, on_earth = found.similarity, isinstance(found, Georeference)
-    up = np.argmax(np.abs(place.rotation @ -cameras[:, :3, 1].mean(axis=0))) if len(cameras) else 1
-    if out.suffix not in NAMED_AXES or not (on_earth or up == 2):
+    z_is_up = on_earth
+    if not on_earth and cameras is not None:
+        z_is_up = int(np.argmax(place.rotation @ -cameras[:, :3, 1].mean(axis=0))) == 2
+    if out.suffix not in NAMED_AXES or not z_is_up:
         return place, "x east, y north, z up" if on_earth else "axes as given"
     turn = _UP_IS_MINUS_Y
     moved = Similarity(place.scale, turn @ place.rotation, turn @ place.translation)
