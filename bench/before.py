@@ -302,7 +302,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
         overrides += QUICK
     check(ROOT)
     output = folder(options, "before")
-    made = {checkout: pieces.Pieces.of(options, output) for checkout in (other, ROOT)}
+    made = {checkout: pieces.Pieces.of(options, output, checkout) for checkout in (other, ROOT)}
     runs: dict[str, dict[str, list[Run]]] = {scene: {} for scene in scenes}
     for seed in seeds:
         for scene in scenes:
@@ -332,7 +332,8 @@ def measure(options: argparse.Namespace) -> list[Row]:
             for run in group
             if run.report is None
         ]
-    return rows + skipped + [row for kept in made.values() for row in kept.rows()]
+    of_other = [] if other == ROOT else [replace(row, name=f"before: {row.name}") for row in made[other].rows()]
+    return rows + skipped + of_other + made[ROOT].rows()
 
 
 def place(scene: str, seed: int, side: str) -> str:

@@ -4,8 +4,9 @@
 
 Figures are matched by benchmark (the file's name) and row. Each kind of figure has a noise, below which a change says
 nothing, and a bound, beyond which it is a regression and the exit code is 1; so is a goal that is no longer met by more
-than the noise, and a number that is none any more. Times, rates and memory are compared with
-wide tolerances, and only warn where the machine is another than the recorded one; ratios and errors hold anywhere.
+than the noise, and a number that is none any more, and a row that is gone, unless a row says that its subject is
+skipped. Times, rates and memory are compared with wide tolerances, and only warn where the machine is another than the
+recorded one; ratios and errors hold anywhere.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.record import RECORDED, Record, read_rows
+from bench.table import SKIPPED, is_skipped
 from mvsgs_core.evaluation.metrics import DEPTH, IMAGE, TRAJECTORY
 from mvsgs_core.machine import processor
 
@@ -42,7 +44,7 @@ _UNITS = {
     "ms/keyframe": Tolerance(1.4, 2.5, False, machine_bound=True, floor=0.05),
     "MB/s": Tolerance(1.4, 2.5, True, machine_bound=True),
     "1/s": Tolerance(1.4, 2.5, True, machine_bound=True),
-    "MB": Tolerance(1.2, 1.6, False, floor=20.0),
+    "MB": Tolerance(1.2, 1.6, False, machine_bound=True, floor=20.0),
 }
 _RATIO = 1.5, 2.5  # of two figures of one run: the machine is out of it, its other work is not
 _ATE = Tolerance(1.5, 3.0, False, floor=1e-3)
@@ -79,7 +81,7 @@ def tolerance(row: dict[str, Any]) -> Tolerance | None:
     the lower.
     """
     figure = row["name"].rpartition(": ")[2].lower()
-    known = _UNITS.get(row["unit"])
+    known = _of_unit(row["unit"])
     ratio = row["unit"] == "x" or re.search(r" / | over ", figure)  # says nothing without a goal
     if known is None and not ratio:
         known = next((rule for words, rule in _NAMED.items() if re.search(rf"\b{words}(?!\w)", figure)), None)
@@ -87,6 +89,12 @@ def tolerance(row: dict[str, Any]) -> Tolerance | None:
         return known
     higher = row["goal"].startswith(">=")
     return replace(known, higher_is_better=higher) if known else Tolerance(*_RATIO, higher_is_better=higher)
+
+
+def _of_unit(unit: str) -> Tolerance | None:
+    """Of the whole unit, or of the first word of one such as "ms/image", "s CPU" or "ms, median"."""
+    word = re.split(r"[ ,]", unit)[0]
+    return _UNITS.get(unit) or _UNITS.get(word) or _UNITS.get(word.partition("/")[0])
 
 
 @dataclass(frozen=True)
@@ -140,18 +148,25 @@ def change(row: dict[str, Any], before: dict[str, Any], same_machine: bool) -> C
 
 
 def compare(name: str, rows: list[dict[str, Any]], recorded: Record) -> list[Change]:
-    """Changes of one benchmark; a row that is gone is one, a regression."""
+    """Changes of one benchmark; a row that is gone is one, a regression, but for those that are skipped."""
     same = recorded.machine == processor()
     before = {row["name"]: row for row in recorded.rows}
     now = {row["name"]: row for row in rows}
+    skipped = [key.removesuffix(SKIPPED) for key in now if is_skipped(key)]
     found = [change(row, before[key], same) for key, row in now.items() if key in before]
     changes = [c for c in found if c is not None]
     changes += [
         Change(key, _text(row["value"], row), "gone", True, True, "the row is missing")
         for key, row in before.items()
-        if key not in now
+        if key not in now and not any(_is_of(key, subject) for subject in skipped)
     ]
     return changes
+
+
+def _is_of(name: str, subject: str) -> bool:
+    """Whether a row's name has, among its parts, what the subject's begins with: of "fr1_xyz, raft_small" are
+    "fr1_xyz: keyframes" and "parts, fr1_xyz, tracked: inliers"."""
+    return subject.partition(", ")[0] in re.split(r": |, |/", name)
 
 
 def _number(value: Any) -> float | None:
@@ -177,11 +192,14 @@ def run(arguments: list[str]) -> int:
         rows = read_rows([file])[0]
         compared += len(rows)
         changes = compare(file.stem, rows, recorded)
-        if changes:
+        skipped = [row for row in rows if is_skipped(row["name"])]
+        if changes or skipped:
             print(f"{file.stem} (recorded at {recorded.commit}, {recorded.date}, {recorded.machine})")
         for c in sorted(changes, key=lambda c: (not c.regression, not c.worse)):
             word = "REGRESSION" if c.regression else "worse" if c.worse else "better"
             print(f"  {word:10}  {c.name}: {c.before} -> {c.now}  {c.note}")
+        for row in skipped:
+            print(f"  not compared: {row['name']}: {row['value']}")
         regressions += sum(c.regression for c in changes)
         worse += sum(c.worse and not c.regression for c in changes)
         better += sum(not c.worse for c in changes)

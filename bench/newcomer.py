@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 import venv
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -177,11 +178,29 @@ def with_checkout(root: Path, video: Path) -> list[Row]:
     return [*rows_of_map(name, who, command, set_up, clone / ".venv"), *rows_of_refusals(name, who, command)]
 
 
+def newest_change(checkout: Path) -> float:
+    """When, in seconds since 1970, what a wheel is made of changed last: by a commit, or a file that differs from it;
+    0 where nothing is under version control."""
+    project = tomllib.loads((checkout / "pyproject.toml").read_text())
+    packages = project["tool"]["scikit-build"]["wheel"]["packages"].values()
+
+    def git(*words: str) -> list[str]:
+        command = ["git", "-C", str(checkout), *words, "--", "CMakeLists.txt", "pyproject.toml", *packages]
+        return subprocess.run(command, capture_output=True, text=True, check=False).stdout.splitlines()
+
+    committed = [float(seconds) for seconds in git("log", "-1", "--format=%ct")]
+    names = [*git("diff", "--name-only", "HEAD"), *git("ls-files", "--others", "--exclude-standard")]
+    changed = [file.stat().st_mtime for name in names if (file := checkout / name).is_file()]
+    return max(committed + changed, default=0.0)
+
+
 def measure(options: argparse.Namespace) -> list[Row]:
     built = sorted((ROOT / "dist").glob("mvsgs-*.whl"), key=lambda file: file.stat().st_mtime)
     wheel = (options.wheel or (built[-1] if built else ROOT / "dist")).absolute()
     if not wheel.is_file():
         raise SystemExit(f"{wheel}: there is no wheel; `make wheel` builds one")
+    if wheel.stat().st_mtime < newest_change(ROOT):
+        raise SystemExit(f"{wheel}: older than what it is made of; `make wheel` builds one of this commit")
     with tempfile.TemporaryDirectory() as folder:
         video = Path(folder) / VIDEO
         record_video(video)

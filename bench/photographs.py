@@ -35,11 +35,11 @@ COVERED = 97.0  # % of the held-out photographs' pixels
 WAYS: dict[str, tuple[Any, ...]] = {"frames": ("all",), "exposure": ("none", "trained"), "rates": tuple(offline.RATES)}
 
 
-def colmap(ours: Ours, place: Path, resume: bool) -> tuple[Model | None, str]:
-    """COLMAP's model of all photographs, at the size of our run; with resume one of the same images is taken again."""
+def colmap(ours: Ours, place: Path, kept: pieces.Kept) -> tuple[Model | None, str]:
+    """COLMAP's model of all photographs, at the size of our run; one of the same images that is kept is taken again."""
     frames = {index: frame.image for index, frame in ours.frames.items()}
     intrinsics = next(iter(ours.frames.values())).intrinsics
-    return colmap_poses.reconstruct_once(frames, intrinsics, place, 1, pieces.Kept(resume), photographs=True)
+    return colmap_poses.reconstruct_once(frames, intrinsics, place, 1, kept, photographs=True)
 
 
 def with_focal(ours: Ours, focal: float) -> Ours:
@@ -95,21 +95,21 @@ def overrides_of(options: argparse.Namespace) -> list[str]:
 def compare(scene: str, options: argparse.Namespace, output: Path) -> list[Row]:
     place = output / scene
     made = pieces.Pieces(place, options.resume)
+    kept = made.kept()
     ours, _ = run_ours(scene, overrides_of(options), {}, place / "ours", made)
     if ours is None:
         return [failed(f"{scene}: ours", why_not(scene, place / "ours"))]
-    rows = [protocol(scene, ours)]
-    model, why = colmap(ours, place / "colmap", options.resume)
+    model, why = colmap(ours, place / "colmap", kept)
     if model is None:
-        return [*rows, *our_rows(scene, ours, set(ours.frames)), Row(f"{scene}: COLMAP", why)]
-    kept = place / "trained.json"
-    if not options.resume:
-        kept.unlink(missing_ok=True)
-    theirs = with_focal(ours, model.focal)
-    train = offline.kept_in(kept, lambda way, seconds: offline.train(model, theirs, way, seconds, 1))
-    _, tried = offline.best_way(ways(options), train, ours.optimization)
-    best = max(tried, key=lambda result: result.psnr)
-    return [*rows, *our_rows(scene, ours, set(model.index.tolist())), *their_rows(scene, ours, model, best)]
+        rows = [*our_rows(scene, ours, set(ours.frames)), Row(f"{scene}: COLMAP", why)]
+    else:
+        theirs, file = with_focal(ours, model.focal), place / "colmap" / "model.npz"
+        train = offline.kept_in(place / "trained", file, kept, partial(offline.train, model, theirs, threads=1))
+        _, tried = offline.best_way(ways(options), train, ours.optimization)
+        best = max(tried, key=lambda result: result.psnr)
+        rows = [*our_rows(scene, ours, set(model.index.tolist())), *their_rows(scene, ours, model, best)]
+    of_parts = [replace(row, name=f"{scene}: {row.name}") for row in made.rows()]
+    return [protocol(scene, ours), *rows, *of_parts]
 
 
 def measure(options: argparse.Namespace) -> list[Row]:

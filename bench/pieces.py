@@ -1,8 +1,9 @@
 """Runs in pieces: a long benchmark can be stopped, goes on where it was, and runs made at several times stand together.
 
 Each piece is a Matrix in a folder of its own, or a file of what was measured. One that ended keeps what was asked for
-and the commit: piece.json of a folder, FILE.asked of a file. With --resume the same command finds it and runs only what
-is missing, failed or was asked for otherwise; without, everything is measured anew.
+and commit, machine and date: piece.json of a folder, FILE.asked of a file. With --resume the same command finds it and
+runs only what is missing, failed or was asked for otherwise; without, everything is measured anew. Where a table holds
+what was measured at another commit, on another machine or another day, its rows say so.
 """
 
 from __future__ import annotations
@@ -11,25 +12,36 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from bench.runs import ROOT, Matrix, Run, commit, missing_data
-from bench.table import Row, as_json, is_failure, skipped
+from bench.table import Origin, Row, as_json, is_failure, origin_rows, skipped
 from mvsgs_core.atomic_file import replace_text
+
+UNKNOWN = "unknown"  # machine and date of a piece that does not say them
+
+
+class NotKept(Exception):
+    """A file that only a measurement could make, where none may begin."""
+
+    def __init__(self, file: Path) -> None:
+        super().__init__(f"{file} is not measured yet")
+        self.file = file
 
 
 @dataclass
 class Pieces:
-    """A folder of pieces. `runs` may be called several times; `commits` and `missing` are about all of them."""
+    """A folder of pieces. `runs` may be called several times; `origins` and `missing` are about all of them."""
 
     output: Path
     resume: bool = False  # pieces that ended are read and not run again, whatever their commit
     collect: bool = False  # nothing is run: only what is there is read
     minutes: float | None = None  # no piece is started after so long; None: all are
-    commits: list[str] = field(default_factory=list)  # of the pieces that were read, each once
+    here: Origin = field(default_factory=Origin.here)  # of the pieces that run
+    origins: list[Origin] = field(default_factory=list)  # of the pieces that there are
     missing: list[str] = field(default_factory=list)  # names of the pieces that did not run
     _start: float = field(default_factory=time.monotonic)
 
@@ -44,37 +56,43 @@ class Pieces:
         found: list[Run] = []
         for name, matrix in matrices.items():
             done = self._known(name, matrix)
-            if done is None and not self._may_start:
+            if done is None and not self.may_start():
                 self.missing.append(name)
                 continue
             place = self.output / name
             if done is None:
                 (place / "piece.json").unlink(missing_ok=True)
-                done = {**asked(matrix), "commit": commit(matrix.checkout)}
+                done = asked(matrix) | asdict(replace(self.here, commit=commit(matrix.checkout)))
                 (run or Matrix.run)(matrix, place)
                 if all(made.report is not None for made in matrix.collect(place)):
                     (place / "piece.json").write_text(json.dumps(done, indent=1))
             found += matrix.collect(place)
-            if done["commit"] not in self.commits:
-                self.commits.append(done["commit"])
+            self.origins.append(_origin(done))
         return found
 
     @staticmethod
-    def of(options: argparse.Namespace, output: Path) -> Pieces:
-        """As the command line, with `arguments`, says."""
-        return Pieces(output, options.resume, options.collect, options.minutes)
+    def of(options: argparse.Namespace, output: Path, checkout: Path = ROOT) -> Pieces:
+        """As the command line, with `arguments`, says. checkout: whose code runs."""
+        return Pieces(output, options.resume, options.collect, options.minutes, Origin.here(checkout))
+
+    def kept(self) -> Kept:
+        """For files beside the runs: read and measured where pieces are, and their origins are among those of these."""
+        return Kept(self.resume or self.collect, self.here, self.origins, self.may_start)
 
     def rows(self) -> list[Row]:
-        """What must be said of how the runs were made; nothing where all are there and of one commit."""
-        rows = []
-        if len(self.commits) > 1:
-            rows.append(Row("runs of the commits", ", ".join(self.commits)))
+        """What must be said of how the runs were made; nothing where all are there and made here."""
+        rows = origin_rows("runs", self.origins, self.here)
         if self.missing:
             rows.append(Row("not run yet (--resume goes on with them)", ", ".join(self.missing)))
         return rows
 
     @property
-    def _may_start(self) -> bool:
+    def commits(self) -> list[str]:
+        """Of the pieces that there are, each once."""
+        return list(dict.fromkeys(origin.commit for origin in self.origins))
+
+    def may_start(self) -> bool:
+        """Whether anything may be measured."""
         late = self.minutes is not None and time.monotonic() - self._start > 60 * self.minutes
         return not self.collect and not late
 
@@ -84,7 +102,7 @@ class Pieces:
         if not (self.resume or self.collect) or not file.exists():
             return None
         done: dict[str, Any] = json.loads(file.read_text())
-        return done if {key: done.get(key) for key in asked(matrix)} == asked(matrix) else None
+        return done if {key: done[key] for key in done.keys() - asdict(self.here)} == asked(matrix) else None
 
 
 @dataclass
@@ -92,23 +110,29 @@ class Kept:
     """Files of what was measured, each with what was asked for beside it."""
 
     resume: bool
-    commits: list[str] = field(default_factory=list)  # that made them, each once
-    _commit: str = field(default_factory=commit)  # of this call
+    here: Origin = field(default_factory=Origin.here)  # of what is measured
+    origins: list[Origin] = field(default_factory=list)  # of the files that there are
+    may_start: Callable[[], bool] = lambda: True  # whether anything may be measured
 
     def has(self, file: Path, asked: Any) -> bool:
-        """Whether an earlier call left the file, and asked for the same: for what JSON can say."""
+        """Whether an earlier call left the file, and asked for the same: for what JSON can say.
+
+        Raises NotKept where it did not and nothing may be measured.
+        """
         beside = _asked_file(file)
         done = json.loads(beside.read_text()) if self.resume and file.exists() and beside.exists() else None
         if done is None or done["asked"] != json.loads(json.dumps(asked)):
+            if not self.may_start():
+                raise NotKept(file)
             beside.unlink(missing_ok=True)  # the file is about to be another
             return False
-        self._made_by(done["commit"])
+        self.origins.append(_origin(done))
         return True
 
     def keep(self, file: Path, asked: Any) -> None:
         """The file is made: a later call may take it."""
-        replace_text(_asked_file(file), json.dumps({"asked": asked, "commit": self._commit}, indent=1))
-        self._made_by(self._commit)
+        replace_text(_asked_file(file), json.dumps({"asked": asked, **asdict(self.here)}, indent=1))
+        self.origins.append(self.here)
 
     def rows(self, file: Path, asked: Any, measured: Callable[[], list[Row]]) -> list[Row]:
         """Rows that an earlier call left in the file, or that are measured now and, if nothing failed, left there."""
@@ -122,12 +146,13 @@ class Kept:
         return rows
 
     def origin(self) -> list[Row]:
-        """What must be said of what was read: nothing where all is of one commit."""
-        return [Row("results of the commits", ", ".join(self.commits))] if len(self.commits) > 1 else []
+        """What must be said of what was read: nothing where all was made here."""
+        return origin_rows("results", self.origins, self.here)
 
-    def _made_by(self, name: str) -> None:
-        if name not in self.commits:
-            self.commits.append(name)
+
+def _origin(done: dict[str, str]) -> Origin:
+    """As a piece says it."""
+    return Origin(done["commit"], done.get("machine", UNKNOWN), done.get("date", UNKNOWN))
 
 
 def _asked_file(file: Path) -> Path:
@@ -181,12 +206,13 @@ def kept_arguments(parser: argparse.ArgumentParser, minutes: bool = False) -> No
 
 
 def asked(matrix: Matrix) -> dict[str, Any]:
-    """What makes two pieces the same: everything but the folder and how many runs went at once."""
+    """What makes two pieces the same: everything but the folder. Times are others where several runs go at once."""
     return {
         "scenes": list(matrix.scenes),
         "variants": list(matrix.variants),
         "seeds": list(matrix.seeds),
         "overrides": list(matrix.overrides),
         "settings": [[setting.name, *setting.overrides] for setting in matrix.settings],
+        **({} if matrix.jobs == 1 else {"jobs": matrix.jobs}),
         **({} if matrix.checkout == ROOT else {"checkout": str(matrix.checkout)}),
     }

@@ -21,6 +21,7 @@ import shutil
 import sys
 import textwrap
 import time
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -88,9 +89,13 @@ class Record:
 
 def merge(runs: list[list[dict[str, Any]]]) -> list[dict[str, Any]]:
     """Rows of repeated runs as one list: means and spreads of numbers, none where a run has none, the last run's words;
-    met if all runs met it."""
+    met if all runs met it. Raises ValueError for a run in which two rows have one name: they are two figures."""
     found: dict[str, list[dict[str, Any]]] = {}
     for rows in runs:
+        if twice := [
+            name for name, count in Counter(row["name"] for row in rows).items() if count > 1 and not is_skipped(name)
+        ]:
+            raise ValueError(f"several rows of one name: {'; '.join(twice)}")
         for row in rows:
             found.setdefault(row["name"], []).append(row)
     merged = []
@@ -163,8 +168,8 @@ def origin(files: Iterable[Path]) -> tuple[dict[str, str], list[Path]]:
 
 
 def merged(name: str, files: list[Path], command: str, made_in: Path | None = None, note: str = "") -> Record:
-    """The runs in `files` as one record, which is not saved. Raises ValueError for rows of which the figures could not
-    be made."""
+    """The runs in `files` as one record, which is not saved. Raises ValueError as `merge`, and for rows of which the
+    figures could not be made."""
     rows = merge(read_rows(files))
     if missing := figures.lacking(name, rows):
         raise ValueError(f"{name}: its record stays as it is, since these rows lack {'; '.join(missing)}")

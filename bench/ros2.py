@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from PIL import Image as Picture
 
-from bench.table import Row, all_of, at_most, main, timed
+from bench.table import Row, all_of, at_most, main, skipped, timed
 from msgs import CameraPose, Frame, FusedKeyframe, Keyframe, Preview
 from nodes.ros2 import forms, messages
 from nodes.ros2.cdr import encode
@@ -145,7 +145,7 @@ def bytes_of_rosbags() -> list[Row]:
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        return [Row("bytes equal to rosbags': skipped", "pip install rosbags")]
+        return [skipped("message types whose bytes equal rosbags'", "pip install rosbags")]
     store = get_typestore(Stores.ROS2_HUMBLE)
 
     def theirs(message: Any) -> Any:
@@ -252,7 +252,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     try:
         from nodes.ros2 import dds
     except ImportError as error:
-        return [*rows, Row("DDS: skipped", f"pip install cyclonedds ({error})")]
+        return rows + [skipped(name, f"pip install cyclonedds ({error})") for name in ("640x480", "publisher")]
     assert dds
     for way in WAYS:
         rows += rows_of(way, 4.0 if options.quick else 60.0)

@@ -1,7 +1,8 @@
 """What every benchmark shares: rows, a table on the screen, `--json FILE`, `--quick`, names on its command line.
 
 FILE gets the rows, with null for a number that is not finite, which JSON does not have, and FILE.origin beside it
-commit, machine and date of the measurement, which `bench.record` keeps.
+commit, machine and date of the measurement, which `bench.record` keeps: those of this call, or where results of other
+calls were read, those that the rows of `origin_rows` name.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import statistics
 import sys
 import time
@@ -20,12 +22,27 @@ from typing import TypeVar
 from rich.console import Console
 from rich.table import Table
 
-from bench.runs import commit
+from bench.runs import ROOT, commit
 from mvsgs_core.machine import processor
 
 T = TypeVar("T")
 REPORT = "a report"  # goal of a run: without one there is nothing to measure
 SKIPPED = ": skipped"  # how the name of a row ends that says what is left out
+_PARTS = {"commits": "commit", "machines": "machine", "dates": "date"}  # of an origin, by what its rows call them
+_ORIGIN = re.compile(rf"(?:runs|results) of the ({'|'.join(_PARTS)})")  # a row of `origin_rows` about all of a table
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where something was measured."""
+
+    commit: str
+    machine: str
+    date: str
+
+    @staticmethod
+    def here(checkout: Path = ROOT) -> Origin:
+        return Origin(commit(checkout), processor(), time.strftime("%Y-%m-%d"))
 
 
 @dataclass(frozen=True)
@@ -72,6 +89,19 @@ def skipped(name: str, why: Path | str) -> Row:
 def is_skipped(name: str) -> bool:
     """Whether a row of this name is one of `skipped`."""
     return name.endswith(SKIPPED)
+
+
+def origin_rows(what: str, origins: Sequence[Origin], here: Origin) -> list[Row]:
+    """What must be said of what was measured in several calls, or in another: commits, machines and dates.
+
+    what: "runs" or "results". Nothing is said of what is all as it is here.
+    """
+    rows = []
+    for plural, part in _PARTS.items():
+        found = list(dict.fromkeys(getattr(origin, part) for origin in origins))
+        if found and found != [getattr(here, part)]:
+            rows.append(Row(f"{what} of the {plural}", ", ".join(found)))
+    return rows
 
 
 def timed(
@@ -150,7 +180,7 @@ def main(
     if arguments:
         arguments(parser)
     options = parser.parse_args()
-    made = {"commit": commit(), "machine": processor(), "date": time.strftime("%Y-%m-%d")}  # of what runs from here on
+    made = asdict(Origin.here())  # of what runs from here on
     if options.json:
         try:
             _try_to_write(options.json)
@@ -160,7 +190,8 @@ def main(
     show(rows, title)
     if options.json:
         options.json.write_text(as_json(rows))
-        origin_of(options.json).write_text(json.dumps(made, indent=1))
+        said = {_PARTS[of[1]]: row.value for row in rows if (of := _ORIGIN.fullmatch(row.name))}
+        origin_of(options.json).write_text(json.dumps(made | said, indent=1))
     if any(map(is_failure, rows)):
         sys.exit(1)
 

@@ -57,6 +57,7 @@ def test_report(evaluator: Evaluator) -> None:
     }
     assert "depth is scored of 1 of 4 keyframes: that of the others did not come" in " ".join(report["notes"])
     assert report["map"]["splats"] == 1200
+    assert report["map"]["iterations"] == report["map"]["iterations_before_refinement"] == 100  # of both maps here
     assert report["time"]["stages"]["tracker"] == {"flow": 1.5}
     assert report["time"]["wall"] > 0
     assert report["memory"]["peak_bytes"]["tracker"] == 5

@@ -7,12 +7,14 @@ frames (every 5th that is no keyframe). It is trained in as many processor secon
 is its best: on our keyframes or on every frame that is not held out, with and without an exposure a frame, settling
 early or late, one choice after the other; then twice as long and so on, until doubling the time gains less than 0.1 dB.
  Both have one thread. --opensplat PATH: OpenSplat on its CPU path, too.
-All times are of the processor. What ended is kept for --resume.
+All times are of the processor. What ended is kept for --resume, but for OpenSplat's maps.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 from bench import pieces
@@ -36,14 +38,14 @@ SHARE = 0.1  # of their whole time, in which ours is to be as good
 THREADS = 1  # of both optimizations
 
 
-def solve_poses(ours: Ours, place: Path, threads: int, resume: bool) -> tuple[Baseline, list[int]]:
-    """COLMAP's model, from the images as they come, and the frames that it got."""
+def solve_poses(ours: Ours, place: Path, threads: int, kept: pieces.Kept) -> tuple[Baseline, list[int]]:
+    """COLMAP's model, from the images as they come, and the frames that it got. Raises pieces.NotKept."""
     stride = max(1, round(len(ours.frames) / EVENLY))
     known = {*ours.keyframes, *(i for i in ours.frames if is_held_out(i) or i % stride == 0)}
     place.mkdir(parents=True, exist_ok=True)
     whole = read_frames({**ours.settings, "size": None})
     items = [Item(i, whole[i].timestamp, whole[i].image, whole[i].intrinsics) for i in sorted(known)]
-    return solve(items, place, threads, pieces.Kept(resume)), sorted(known)
+    return solve(items, place, threads, kept), sorted(known)
 
 
 def pose_rows(scene: str, ours: Ours, model: Model, frames: list[int]) -> list[Row]:
@@ -122,34 +124,36 @@ def protocol(scene: str, ours: Ours, baseline: Baseline, frames: list[int]) -> R
     return Row(f"{scene}: protocol", text)
 
 
-def compare(scene: str, options: argparse.Namespace, overrides: list[str], made: pieces.Pieces) -> list[Row]:
-    place = made.output / scene
+def compare(scene: str, options: argparse.Namespace, overrides: list[str], made: pieces.Pieces) -> Iterator[list[Row]]:
+    """The rows of a scene, part by part. Raises pieces.NotKept at the first that is not there and may not begin."""
+    place, kept = made.output / scene, made.kept()
     ours, fewer = run_ours(scene, overrides, options.fewer, place / "ours", made)
     if ours is None:
-        if any(name.startswith(f"{scene}/") for name in made.missing):
-            return []
-        return [failed(f"{scene}: ours", why_not(scene, place / "ours"))]
-    resume = options.resume or options.collect
-    baseline, frames = solve_poses(ours, place / "colmap", options.threads or available_cores(), resume)
-    rows = [protocol(scene, ours, baseline, frames)]
+        there = not any(name.startswith(f"{scene}/") for name in made.missing)
+        yield [failed(f"{scene}: ours", why_not(scene, place / "ours"))] if there else []
+        return
+    baseline, frames = solve_poses(ours, place / "colmap", options.threads or available_cores(), kept)
+    yield [protocol(scene, ours, baseline, frames)]
     model = baseline.model
     if model is None:
-        return [*rows, Row(f"{scene}: COLMAP", baseline.why)]
-    rows += [*pose_rows(scene, ours, model, frames), *our_rows(scene, ours, model)]
-    kept = place / "trained.json"
-    if not resume:
-        kept.unlink(missing_ok=True)
-    train = offline.kept_in(kept, lambda way, seconds: offline.train(model, ours, way, seconds, THREADS))
+        yield [Row(f"{scene}: COLMAP", baseline.why)]
+        return
+    yield [*pose_rows(scene, ours, model, frames), *our_rows(scene, ours, model)]
+    train_anew = partial(offline.train, model, ours, threads=THREADS)
+    train = offline.kept_in(place / "trained", place / "colmap" / "model.npz", kept, train_anew)
     try:
         parts = {} if options.quick else offline.choices(ours)
         best, tried = offline.best_way(parts, train, ours.optimization)
         trained = offline.train_longer(best, train, ours.optimization, options.longest)
     except ValueError as error:
-        return [*rows, Row(f"{scene}: map, COLMAP + splatting", str(error))]
-    rows += longer_rows(scene, model, trained)
-    rows += [Row(f"{scene}: equal time, {result.way}: held-out PSNR", result.psnr, "dB") for result in tried]
-    rows += verdict(scene, ours, fewer, model, trained[0])
-    return rows + opensplat_rows(scene, options.opensplat, ours, model, place / "opensplat")
+        yield [Row(f"{scene}: map, COLMAP + splatting", str(error))]
+        return
+    yield longer_rows(scene, model, trained)
+    yield [Row(f"{scene}: equal time, {result.way}: held-out PSNR", result.psnr, "dB") for result in tried]
+    yield verdict(scene, ours, fewer, model, trained[0])
+    if options.opensplat is not None and not made.may_start():
+        raise pieces.NotKept(place / "opensplat")
+    yield opensplat_rows(scene, options.opensplat, ours, model, place / "opensplat")
 
 
 def opensplat_rows(scene: str, binary: Path | None, ours: Ours, model: Model, place: Path) -> list[Row]:
@@ -175,7 +179,13 @@ def measure(options: argparse.Namespace) -> list[Row]:
         scenes, skipped, options.longest = [QUICK_SCENE], [], 1.0
         overrides += QUICK
     made = pieces.Pieces.of(options, folder(options, "baselines"))
-    rows = [row for scene in scenes for row in compare(scene, options, overrides, made)]
+    rows: list[Row] = []
+    for scene in scenes:
+        try:
+            for part in compare(scene, options, overrides, made):
+                rows += part
+        except pieces.NotKept as missing:
+            made.missing.append(str(missing.file.relative_to(made.output)))
     return rows + skipped + made.rows()
 
 

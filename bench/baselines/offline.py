@@ -6,9 +6,11 @@ other takes what is best by held-out PSNR: with hindsight, which an offline user
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,10 @@ import numpy as np
 from bench.baselines.colmap_poses import Model
 from bench.baselines.ours import Ours
 from bench.baselines.sparse_splats import Posed, SparseConfig, SparseMap
+from bench.pieces import Kept
+from bench.runs import folder_name
 from mvsgs_core import image_metrics
+from mvsgs_core.atomic_file import replace_text
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.optimizer import OptimizerConfig
 
@@ -99,16 +104,22 @@ def score(renders: Any) -> tuple[float, float]:
     return float(psnr), float(ssim)
 
 
-def kept_in(file: Path, train: Train) -> Train:
-    """`train` that takes what an earlier call left in `file`, of the same way and time, and adds what is new."""
-    known = {(e["way"], e["asked"]): Trained(**e) for e in json.loads(file.read_text())} if file.exists() else {}
+def kept_in(folder: Path, model: Path, kept: Kept, train: Train) -> Train:
+    """`train` that takes what an earlier call left in `folder`, of the same COLMAP model (its file), way and time, and
+    leaves what is new there. It trains nothing twice."""
+    digest = hashlib.sha256(model.read_bytes()).hexdigest()
+    folder.mkdir(exist_ok=True)
 
+    @cache
     def found(way: Way, seconds: float) -> Trained:
-        key = way.name, seconds
-        if key not in known:
-            known[key] = train(way, seconds)
-            file.write_text(json.dumps([asdict(result) for result in known.values()], indent=1))
-        return known[key]
+        file = folder / f"{folder_name(way.name)}_{seconds:.4g}.json"
+        asked = {"model": digest, "way": way.name, "seconds": seconds}
+        if kept.has(file, asked):
+            return Trained(**json.loads(file.read_text()))
+        result = train(way, seconds)
+        replace_text(file, json.dumps(asdict(result), indent=1))
+        kept.keep(file, asked)
+        return result
 
     return found
 

@@ -63,7 +63,7 @@ def load_scene(
     source = SOURCES[name]
     options = source.options | changes
     if source.dataset == "synthetic":
-        options["size"] = (240, 320) if area <= 320 * 240 else (384, 512)
+        options["size"] = rendered_size(area)
     else:
         options |= {"path": DATA / source.folder, "stride": source.stride}
     frames: Iterable[Item] = open_dataset(source.dataset, **options)
@@ -83,6 +83,11 @@ def load_scene(
         size = (view.size[1], view.size[0])
         truths.append(None if item.depth is None else cv2.resize(item.depth, size, interpolation=cv2.INTER_NEAREST))
     return Scene(name, items, views, truths, source.tolerance)
+
+
+def rendered_size(area: int) -> tuple[int, int]:
+    """Height and width of a rendered scene for depth maps of so many pixels."""
+    return (240, 320) if area <= 320 * 240 else (384, 512)
 
 
 def _pose(item: Item) -> np.ndarray:

@@ -27,7 +27,7 @@ def kernel_rows(quick: bool) -> list[Row]:
     """Processor time of one sweep, ours over the plain loops'; sizes of the default's two stages."""
     compiler = shutil.which(os.environ.get("CXX", "c++")) or shutil.which("g++") or shutil.which("clang++")
     if compiler is None:
-        return [skipped("cost kernel against plain loops", "no C++ compiler")]
+        return [skipped("cost kernel", "no C++ compiler")]
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         library = Path(folder) / "plain.so"

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bench.depth.data import SOURCES, Scene
+from bench.depth.data import SOURCES, Scene, rendered_size
 from bench.runs import DATA
 from msgs import Frame, Keyframe, Poses
 from mvsgs_core.datasets import Item, open_dataset
@@ -45,12 +45,11 @@ class Collected:
 
 
 @lru_cache(maxsize=2)
-def _track(name: str) -> tuple[dict[int, Item], Collected]:
-    """Frames by index, and keyframes."""
+def _track(name: str, size: tuple[int, int] | None) -> tuple[dict[int, Item], Collected]:
+    """Frames by index, and keyframes. size: of a rendered scene."""
     source = SOURCES[name]
-    options = dict(source.options)
-    if source.dataset != "synthetic":
-        options["path"] = DATA / source.folder
+    given = {"path": DATA / source.folder} if size is None else {"size": size}
+    options = source.options | given
     items: dict[int, Item] = {}
     tracker, sent = Tracker(), Collected()
     for item in open_dataset(source.dataset, **options):
@@ -69,7 +68,7 @@ def load_tracked(name: str, area: int, scales: tuple[int, ...] = (1, 2)) -> Scen
 
     Raises FileNotFoundError where the data is missing and ValueError where the tracker gave no keyframe.
     """
-    items, sent = _track(name)
+    items, sent = _track(name, rendered_size(area) if SOURCES[name].dataset == "synthetic" else None)
     views, truths, ratios = sent.views(area, scales), [], []
     for view in views:
         truth = items[view.index].depth

@@ -2,7 +2,8 @@
 
 ATE is the RMS position error after Sim(3) alignment, of keyframes and of all frames with a pose, each segment apart
 (the worst counts). Times are processor time of one thread, so that a busy machine does not change them. On the other
-core run COLMAP, on the same frames, and then a long stream whose memory is watched.
+core run COLMAP, on the same frames, and then a long stream whose memory is watched. COLMAP's models are kept for
+--resume; all else is measured anew.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ import cv2
 import numpy as np
 
 from bench.aligned import aligned_error
+from bench.pieces import Kept, kept_arguments
 from bench.runs import folder
-from bench.table import Row, at_most, main, skipped
+from bench.table import Origin, Row, at_most, main, skipped
 from bench.tracking import baselines, curves, loop, memory
 from bench.tracking.baselines import Baseline
 from bench.tracking.cases import CASES, Case
@@ -165,13 +167,14 @@ def measure(options: argparse.Namespace) -> list[Row]:
     cv2.setNumThreads(1)
     chosen = [n for n, c in CASES.items() if (c.quick or not options.quick) and n in (options.only or CASES)]
     whole = not options.quick
-    place = folder(options, "tracking")
+    place, kept = folder(options, "tracking"), Kept(options.resume)
+    kept.origins.append(kept.here)  # of our own runs
     rows: list[Row] = []
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as beside:
-        solved: dict[str, Future[Baseline]] = {}
+        solved: dict[str, Future[tuple[Baseline, list[Origin]]]] = {}
         for name in chosen if options.colmap and whole else []:
             if CASES[name].baseline_stride and not CASES[name].hard and CASES[name].there:
-                solved[name] = beside.submit(baselines.solve_case, name, place / "colmap")
+                solved[name] = beside.submit(baselines.solve_case, name, place / "colmap", options.resume)
         long = whole and (not options.only or "memory" in options.only)
         long_run = beside.submit(memory.follow, options.frames) if long else None
         for name in chosen:
@@ -182,13 +185,15 @@ def measure(options: argparse.Namespace) -> list[Row]:
                     rows += curve(name, CASES[name].items(), place)
         if not options.only:
             rows += parts(options)
-        for name, baseline in solved.items():
+        for name, future in solved.items():
             items = CASES[name].items()[:: CASES[name].baseline_stride]
             ours = run(items)
-            rows += baselines.rows(name, baseline.result(), ours.path, items, ours.total + ours.end)
+            baseline, origins = future.result()
+            kept.origins += origins
+            rows += baselines.rows(name, baseline, ours.path, items, ours.total + ours.end)
         if long_run is not None:
             rows += memory.rows(long_run.result())
-    return rows
+    return rows + kept.origin()
 
 
 def rows_of_case(name: str, case: Case, options: argparse.Namespace) -> list[Row]:
@@ -214,7 +219,7 @@ def arguments(parser: argparse.ArgumentParser) -> Any:
     parser.add_argument("--colmap", action=flag, default=True, help="pycolmap on the same frames (one core, minutes)")
     parser.add_argument("--curve", action=flag, default=True, help="run time against error over the main settings")
     parser.add_argument("--frames", type=int, default=2000, help="of the run whose memory is measured, more than 500")
-    parser.add_argument("--output", type=Path, help="folder for plots and COLMAP's models; default: in runs")
+    kept_arguments(parser)
 
 
 if __name__ == "__main__":

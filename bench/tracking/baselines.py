@@ -11,7 +11,7 @@ import numpy as np
 from bench.aligned import aligned_error
 from bench.baselines.colmap_poses import Model, reconstruct_once
 from bench.pieces import Kept
-from bench.table import Row, at_most
+from bench.table import Origin, Row, at_most
 from bench.tracking.cases import CASES
 from mvsgs_core.camera import fit_size, resize_image, scale_intrinsics
 from mvsgs_core.datasets import Item
@@ -39,12 +39,15 @@ def solve(items: Sequence[Item], folder: Path, threads: int, kept: Kept) -> Base
     return Baseline(*reconstruct_once(frames, intrinsics, folder, threads, kept), small)
 
 
-def solve_case(name: str, folder: Path) -> Baseline:
-    """`solve` for a sequence of the benchmark, by one thread: for a process of its own, beside which ours is timed."""
-    case = CASES[name]
+def solve_case(name: str, folder: Path, resume: bool) -> tuple[Baseline, list[Origin]]:
+    """`solve` for a sequence of the benchmark, by one thread: for a process of its own, beside which ours is timed.
+
+    And where that was measured.
+    """
+    case, kept = CASES[name], Kept(resume)
     place = folder / "".join(c if c.isalnum() else "_" for c in name)
     place.mkdir(parents=True, exist_ok=True)
-    return solve(case.items()[:: case.baseline_stride], place, 1, Kept(True))
+    return solve(case.items()[:: case.baseline_stride], place, 1, kept), kept.origins
 
 
 def rows(name: str, baseline: Baseline, path: Trajectory, items: Sequence[Item], seconds: float) -> list[Row]:

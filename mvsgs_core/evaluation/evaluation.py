@@ -96,7 +96,7 @@ class Evaluation:
         notes: list[str] = []
         alignment, trajectory_report = self._score_trajectory(notes)
         rendering = {refined: self._score_renders(refined, notes) for refined in (True, False)}
-        final = self.finished
+        final, before = self.finished, self.maps.get(False)
         wall = None if self.started is None or self.mapped is None else self.mapped - self.started
         keyframes = trajectory_report["keyframes"]
         return {
@@ -110,6 +110,7 @@ class Evaluation:
                 "splats": len(final.splats.means) if final else 0,
                 "bytes": ply_size(final) if final else 0,
                 "iterations": final.iterations if final else 0,
+                "iterations_before_refinement": before.iterations if before else None,
                 "kernel": final.kernel if final else None,
             },
             "time": {

@@ -20,46 +20,19 @@ from bench.baselines import __main__ as baselines
 from bench.baselines import colmap_poses, offline, opensplat
 from bench.baselines.colmap_poses import Model
 from bench.baselines.offline import Trained, Way
-from bench.baselines.ours import Ours, ate_percent, cheapest, iterations_of, run_ours
+from bench.baselines.ours import ate_percent, cheapest, iterations_of, run_ours
 from bench.baselines.sparse_splats import Posed, SparseConfig, SparseMap
-from bench.pieces import Pieces
+from bench.pieces import Kept, Pieces
 from bench.runs import Run, fewer_iterations
-from bench.table import Row
-from msgs import GroundTruth
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.export.ply import write_ply
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.rasterizer.splats import Splats
+from tests.support.offline_peers import NOTHING, by_name, report, six_frames
 
-NOTHING = np.zeros(0)
 ON_CPU = MapperConfig(threads=1, device="cpu")
 NO_MODEL = Model(NOTHING, NOTHING, NOTHING, NOTHING, {"mapping": 5.0}, 9.0)
-
-
-def report(psnr: float = 25.0, mapper: float = 3.0) -> dict[str, Any]:
-    frames = [{"index": i, "psnr": psnr + i - 5, "held_out": i == 5} for i in (0, 3, 5)]
-    return {
-        "rendering": {"held_out": {"psnr": psnr, "ssim": 0.8}, "frames": frames},
-        "map": {"splats": 1000, "iterations": 90},
-        "time": {"cpu": {"tracker": 1.0, "mapper": mapper, "evaluator": 50.0}},
-    }
-
-
-def six_frames(track: dict[str, Any] | None = None, **figures: Any) -> Ours:
-    """Frames 0 to 5, of which 0 and 3 are keyframes and 5 is held out."""
-    frames = {}
-    for i in range(6):
-        pose = np.eye(4)
-        pose[:3, 3] = (i, i % 2, 0.1 * i)
-        gray = np.full((12, 16, 3), 40 * i, np.uint8)
-        frames[i] = GroundTruth(i, 0.1 * i, gray, np.array([9.0, 9, 5, 3]), pose, None)
-    path = {"index": [0, 3, 5], "keyframe": [True, True, False], "world_from_cam": [None] * 3, **(track or {})}
-    return Ours(report(**figures), path, frames, iterations="15 a keyframe")
-
-
-def by_name(rows: list[Row]) -> dict[str, Row]:
-    return {row.name: row for row in rows}
 
 
 def test_ours_has_its_frames_its_times_and_its_exposures() -> None:
@@ -104,7 +77,7 @@ def test_colmap_s_model_of_other_images_is_not_taken(tmp_path: Path, monkeypatch
     for size, resume in ((4, True), (4, True), (6, True), (6, False)):
         small = six_frames()
         frames = {0: replace(small.frames[0], image=np.zeros((2, size, 3), np.uint8))}
-        assert photographs.colmap(replace(small, frames=frames), tmp_path, resume) == (NO_MODEL, "")
+        assert photographs.colmap(replace(small, frames=frames), tmp_path, Kept(resume)) == (NO_MODEL, "")
     assert made == [24, 36, 36]
 
 
@@ -171,13 +144,15 @@ def test_theirs_is_trained_in_every_way_and_the_best_goes_on_until_twice_the_tim
     ours = six_frames()
     measured = offline.choices(six_frames({"exposure": [None] * 3}))
     assert measured["exposure"] == ("none", "trained", "tracker")  # where our tracker has exposures, theirs too
-    kept = offline.kept_in(tmp_path / "trained.json", train)
+    model, place = tmp_path / "model.npz", tmp_path / "trained"
+    model.write_bytes(b"a model")
+    kept = offline.kept_in(place, model, Kept(False), train)
     best, tried = offline.best_way(offline.choices(ours), kept, ours.optimization)
     assert best == Way("all", "trained", "ours", 0.1)
     assert len(tried) == 6
     cut_short = offline.train_longer(best, kept, 3.0, 2.0)
     assert not offline.converged(cut_short)
-    again = offline.kept_in(tmp_path / "trained.json", train)
+    again = offline.kept_in(place, model, Kept(True), train)
     found = offline.train_longer(best, again, 3.0, 64.0)
     assert [seconds for _, seconds in asked] == [3.0] * 6 + [6.0, 12.0, 24.0]  # what is kept is not made again
     assert offline.converged(found)
@@ -189,6 +164,10 @@ def test_theirs_is_trained_in_every_way_and_the_best_goes_on_until_twice_the_tim
     assert not short["room: COLMAP + splatting, gain by the last doubling of its time"].met
     again(best, 3.5)
     assert asked[-1] == (best, 3.5)  # results of another time are no start
+    count = len(asked)
+    model.write_bytes(b"another model")
+    offline.kept_in(place, model, Kept(True), train)(best, 3.5)
+    assert len(asked) == count + 1  # nor are those of other poses and points
 
 
 def test_ours_is_to_be_better_at_equal_time_and_as_good_in_a_tenth_of_theirs() -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from bench.depth import failures
-from bench.depth.__main__ import SECTIONS, SMALL
+from bench.depth import failures, tracked
+from bench.depth.__main__ import LARGE, SECTIONS, SMALL
 from bench.depth.calibration import fit, reliability
 from bench.depth.curves import Point, settings
 from bench.depth.data import Scene, coarse_grid, without_ragged_edges
@@ -145,6 +147,28 @@ def test_the_default_runs_in_turns_with_its_variants(monkeypatch: pytest.MonkeyP
     assert (rows["default: processor time"].value, rows["default: processor time"].spread) == (8000.0, 2000.0)
     changes = [rows[f"{name}: processor time, change"].value for name in "abc"]
     assert changes == ["~ +1e+03", "~ -1e+03", "-5e+03"]
+
+
+@pytest.mark.parametrize(("name", "sizes"), [("room", [(240, 320), (384, 512)]), ("redkitchen", [None])])
+def test_a_rendered_room_is_tracked_at_the_size_of_its_depth_maps(
+    name: str, sizes: list[tuple[int, int] | None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A real sequence, which has a size of its own, once."""
+    read: list[tuple[int, int] | None] = []
+
+    def nothing(dataset: str, **options: Any) -> Iterator[None]:
+        read.append(options.get("size"))
+        return iter(())
+
+    monkeypatch.setattr(tracked, "open_dataset", nothing)
+    tracked._track.cache_clear()
+    monkeypatch.setattr(tracked.Collected, "views", lambda *_: [])
+    monkeypatch.setattr(tracked.Collected, "take", lambda self, _: self.keyframes.update({0: None}))
+    for area in (SMALL, LARGE):
+        with pytest.raises(ValueError, match="need at least one array"):
+            tracked.load_tracked(name, area)
+    tracked._track.cache_clear()
+    assert read == sizes
 
 
 def test_a_filter_that_keeps_nothing_has_no_outliers_and_misses_its_goal(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,6 +36,17 @@ def test_a_run_that_failed_meets_no_goal() -> None:
     assert [row.met for row in rows if row.goal] == [False] * 4
 
 
+def test_the_iterations_between_both_maps_are_said() -> None:
+    live, unhurried = (
+        report({0: 20.0}, map={"iterations": whole, "iterations_before_refinement": before})
+        for whole, before in ((900, 200), (1900, 700))
+    )
+    said = {row.name: row.value for row in rows_of_loss("x", live, unhurried)}
+    assert said["x: iterations from there to the refined map"] == "700 (1200 without hurry)"
+    said = {row.name: row.value for row in rows_of_loss("x", Result(None), unhurried)}
+    assert said["x: iterations from there to the refined map"] == "unknown (1200 without hurry)"
+
+
 def test_without_the_governed_run_the_others_have_no_goal_to_meet() -> None:
     unhurried, nothing = report({0: 21.0}), Result(None)
     goal = below(nothing, unhurried, False) + 2.0

@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
+from bench import photographs
+from bench.baselines import offline
+from bench.baselines.colmap_poses import Model
+from bench.baselines.offline import Trained, Way
 from bench.baselines.ours import Ours
 from bench.photographs import our_rows, with_focal
+from bench.pieces import Kept
+from bench.table import Row
 from msgs import GroundTruth
 
 
@@ -41,3 +53,33 @@ def test_theirs_have_their_own_focal_length() -> None:
     changed = with_focal(ours(), 12.0)
     assert changed.frames[4].intrinsics.tolist() == [12.0, 12.0, 2.5, 1.5]
     assert changed.keyframes == ours().keyframes
+
+
+def test_a_scene_says_which_of_its_parts_are_of_another_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trained: list[str] = []
+
+    def colmap(ours: Ours, place: Path, kept: Kept) -> tuple[Model, str]:
+        place.mkdir(parents=True, exist_ok=True)
+        (place / "model.npz").write_text("a model")
+        none = np.zeros(0)
+        return Model(np.array([0, 5, 10]), none, none, none, {}, 9.0, 12.0), ""
+
+    def train(model: Model, ours: Ours, way: Way, seconds: float, threads: int) -> Trained:
+        trained.append(way.name)
+        return Trained(seconds, 20.0, 0.8, 10, 20, seconds, way.name)
+
+    monkeypatch.setattr(photographs, "colmap", colmap)
+    monkeypatch.setattr(offline, "train", train)
+    mapped = replace(ours(), report={**ours().report, "map": {"splats": 7, "iterations": 90}})
+    monkeypatch.setattr(photographs, "run_ours", lambda *_: (mapped, {}))
+
+    def said(resume: bool) -> list[Any]:
+        options = argparse.Namespace(resume=resume, overrides=[], quick=True)
+        rows: list[Row] = photographs.compare("a", options, tmp_path)
+        return [row.value for row in rows if row.name == "a: runs of the commits"]
+
+    assert said(False) == []
+    (file,) = (tmp_path / "a" / "trained").glob("*.asked")
+    file.write_text(json.dumps({**json.loads(file.read_text()), "commit": "abc1234"}))
+    assert said(True) == ["abc1234"]
+    assert len(trained) == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from bench import ablation
-from bench.pieces import Kept, Pieces, with_data
+from bench.pieces import Kept, NotKept, Pieces, with_data
 from bench.runs import CONF, Matrix, Run
 from bench.table import Row
 from nodes.mapper import Mapper
@@ -89,10 +90,52 @@ def test_a_file_of_other_settings_is_not_taken(tmp_path: Path) -> None:
     first.keep(file, asked)
     assert not Kept(True).has(file, {**asked, "cores": 1})
     first.keep(file, asked)
-    other = Kept(True, _commit="abc1234")
+    other = Kept(True, replace(first.here, commit="abc1234"))
     assert other.has(file, asked)
     other.keep(tmp_path / "other.json", asked)
-    assert [str(row.value) for row in other.origin()] == [f"{first.commits[0]}, abc1234"]
+    assert [str(row.value) for row in other.origin()] == [f"{first.here.commit}, abc1234"]
+
+
+def test_runs_that_are_all_of_another_commit_machine_or_day_say_so(tmp_path: Path, ran: list[str]) -> None:
+    Pieces(tmp_path).runs(matrices("room"))
+    file = tmp_path / "room" / "piece.json"
+    made = json.loads(file.read_text())
+    for part, value in (("commit", "abc1234"), ("machine", "another"), ("date", "2026-01-02")):
+        file.write_text(json.dumps({**made, part: value}))
+        found = Pieces(tmp_path, collect=True)
+        assert found.runs(matrices("room"))
+        assert found.rows() == [Row(f"runs of the {part}s", value)]
+    file.write_text(json.dumps({key: value for key, value in made.items() if key not in ("machine", "date")}))
+    silent = Pieces(tmp_path, collect=True)
+    assert silent.runs(matrices("room"))
+    assert [row.value for row in silent.rows()] == ["unknown", "unknown"]
+    kept = Kept(False, replace(silent.here, commit="abc1234"))
+    (tmp_path / "rows.json").touch()
+    kept.keep(tmp_path / "rows.json", 1)
+    later = Kept(True)
+    assert later.has(tmp_path / "rows.json", 1)
+    assert later.origin() == [Row("results of the commits", "abc1234")]
+    assert ran == ["room"]
+
+
+def test_runs_that_went_beside_each_other_are_not_taken_for_runs_alone(tmp_path: Path, ran: list[str]) -> None:
+    """Their times are others."""
+    for jobs in (2, 1, 2, 2):
+        Pieces(tmp_path, resume=True).runs({"room": Matrix(["room"], jobs=jobs)})
+    assert ran == ["room", "room", "room"]
+
+
+def test_where_runs_are_only_read_a_file_that_is_missing_is_not_measured(tmp_path: Path) -> None:
+    file = tmp_path / "rows.json"
+    file.touch()
+    Kept(False).keep(file, 1)
+    pieces = Pieces(tmp_path, collect=True)
+    kept = pieces.kept()
+    assert kept.has(file, 1)
+    with pytest.raises(NotKept, match=r"rows\.json is not measured yet"):
+        kept.has(file, 2)
+    assert kept.has(file, 1)
+    assert len(pieces.origins) == 2  # one table, one statement
 
 
 def test_scenes_whose_data_are_missing_are_left_out_and_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -39,6 +39,13 @@ def test_repeated_runs_are_merged_with_their_spread() -> None:
     assert merged[1] == {**row("only", "word"), "spread": None}
 
 
+def test_two_rows_of_one_name_in_one_run_are_not_taken_for_two_runs() -> None:
+    with pytest.raises(ValueError, match="several rows of one name: a"):
+        record.merge([[row("a", 1.0), row("b", 1.0), row("a", 2.0)]])
+    skipped = row("redkitchen: skipped", "no data")
+    assert len(record.merge([[skipped, skipped]])) == 1  # by two sections: no figure
+
+
 def test_a_figure_that_one_of_the_runs_lacks_is_none(tmp_path: Path) -> None:
     files = [tmp_path / "a.json", tmp_path / "b.json"]
     files[0].write_text('[{"name": "psnr", "value": null, "met": false}, {"name": "time", "value": NaN}]')
@@ -213,6 +220,9 @@ def test_the_figures_name_rows_that_are_recorded_and_benchmarks_that_print_them(
         (row("psnr", 25.0, "dB"), row("psnr", float("nan"), "dB"), "regression"),
         (row("latency", 10.0, "ms"), row("latency", 13.0, "ms"), None),
         (row("latency", 10.0, "ms"), row("latency", 30.0, "ms"), "regression"),
+        (row("front end", 10.0, "ms/frame CPU", "<= 40", True), row("front end", 13.0, "ms/frame CPU"), None),
+        (row("processor", 1.0, "s a keyframe"), row("processor", 3.0, "s a keyframe"), "regression"),
+        (row("delay", 10.0, "ms, median"), row("delay", 30.0, "ms, median"), "regression"),
         (row("throughput", 1000.0, "MB/s"), row("throughput", 300.0, "MB/s"), "regression"),
         (row("room/full: ATE %", 0.4, "% of the path"), row("room/full: ATE %", 0.5, "% of the path"), None),
         (row("room/full: ATE %", 0.4, "% of the path"), row("room/full: ATE %", 2.0, "% of the path"), "regression"),
@@ -265,6 +275,11 @@ def test_times_of_another_machine_warn_only_and_the_recorded_spread_counts() -> 
     assert slow is not None
     assert slow.worse
     assert not slow.regression
+    for unit in ("ms/frame CPU", "ms/keyframe CPU", "s CPU", "ms/image", "MB", "MB, jpeg"):
+        goal = unit, "<= 500", True
+        found = compare.change(row("cost", 400.0, *goal), row("cost", 100.0, *goal), same_machine=False)
+        assert found is not None, unit
+        assert (found.worse, found.regression) == (True, False), unit
     assert compare.change(row("psnr", 24.0, "dB"), {**row("psnr", 25.0, "dB"), "spread": 0.5}, True) is None
 
 
@@ -279,6 +294,36 @@ def test_compare_exits_with_one_for_regressions_only(tmp_path: Path, capsys: pyt
     assert "REGRESSION  psnr: 25 dB -> 20 dB" in printed
     assert "the row is missing" in printed
     assert compare.run([str(now), "--recorded", str(tmp_path / "empty")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("benchmark", "skipped", "gone"),
+    [
+        ("learned", ["fr1_xyz, itermvs", "fr1_xyz, raft_small"], "fr1_xyz"),
+        ("tracking", ["tum_fr1_xyz"], "tum_fr1_xyz"),
+        ("networks", ["IterMVS, 5 views"], "IterMVS"),
+        ("ros2", ["message types whose bytes equal rosbags'", "640x480", "publisher"], ""),
+        ("depth", ["cost kernel"], "cost kernel"),
+    ],
+)
+def test_what_is_skipped_is_not_compared(benchmark: str, skipped: list[str], gone: str) -> None:
+    recorded = record.Record.load(f"quick/{benchmark}")
+    rows = [r for r in recorded.rows if not r["name"].startswith(gone)]
+    assert len(rows) < len(recorded.rows)
+    assert any(c.regression for c in compare.compare(benchmark, rows, recorded))
+    assert compare.compare(benchmark, rows + [row(f"{name}: skipped", "no data") for name in skipped], recorded) == []
+    if rows:
+        rest = [row(f"{name}: skipped", "no data") for name in skipped]
+        assert any(c.regression for c in compare.compare(benchmark, rest, recorded))
+
+
+def test_compare_says_what_it_does_not_compare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line, now = tmp_path / "line", tmp_path / "tracking.json"
+    now.write_text(json.dumps([row("walk: keyframes", 25.0)]))
+    record.record("tracking", [now], "c", folder=line)
+    now.write_text(json.dumps([row("walk: skipped", "/data/walk is missing")]))
+    assert compare.run([str(now), "--recorded", str(line)]) == 0
+    assert "  not compared: walk: skipped: /data/walk is missing" in capsys.readouterr().out
 
 
 def test_what_is_recorded_of_variants_and_curves_can_be_run() -> None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
 
 from bench import curves
 from bench.table import (
+    Origin,
     Row,
     at_least,
     at_most,
@@ -21,6 +23,7 @@ from bench.table import (
     names,
     numbers,
     origin_of,
+    origin_rows,
     skipped,
     timed,
 )
@@ -39,7 +42,7 @@ def ended(monkeypatch: pytest.MonkeyPatch, rows: list[Row], *words: str) -> int:
 def test_rows_go_into_a_folder_that_is_made_and_say_where_they_are_from(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bench.table.commit", lambda: "abc1234")
+    monkeypatch.setattr("bench.table.commit", lambda *_: "abc1234")
     file = tmp_path / "new" / "rows.json"
     assert ended(monkeypatch, [Row("a", 1.0)], "--json", str(file)) == 0
     assert json.loads(file.read_text()) == [
@@ -48,6 +51,19 @@ def test_rows_go_into_a_folder_that_is_made_and_say_where_they_are_from(
     made = json.loads(origin_of(file).read_text())
     assert made["commit"] == "abc1234"
     assert made.keys() == {"commit", "machine", "date"}
+
+
+def test_a_file_of_what_other_calls_measured_names_their_commit_and_day(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = Origin.here()
+    file = tmp_path / "rows.json"
+    before = replace(here, commit="abc1234", date="2026-01-02")
+    rows = [*origin_rows("runs", [before], here), Row("before: runs of the commits", "def5678"), Row("a", 1.0)]
+    assert [row.name for row in rows[:2]] == ["runs of the commits", "runs of the dates"]
+    assert ended(monkeypatch, rows, "--json", str(file)) == 0
+    assert json.loads(origin_of(file).read_text()) == asdict(before)
+    assert origin_rows("runs", [here, here], here) == origin_rows("runs", [], here) == []
 
 
 def test_what_is_no_finite_number_is_null_in_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

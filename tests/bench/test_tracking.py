@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 from pathlib import Path
@@ -111,6 +112,28 @@ def test_colmaps_model_is_kept_for_the_same_images_only(tmp_path: Path, monkeypa
     baselines.solve(items[:4], tmp_path, 2, Kept(True))  # more threads take more time of the processor
     baselines.solve(items[:4], tmp_path, 2, Kept(False))
     assert calls == [5, 4, 4, 4]
+
+
+def test_colmap_is_solved_anew_unless_told_to_resume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    items, _ = moving(4)
+    solved: list[Path] = []
+
+    def reconstruct(frames: dict[int, np.ndarray], intrinsics: np.ndarray, place: Path, *_: object) -> tuple[str, str]:
+        solved.append(place)
+        (place / "model.npz").touch()
+        return "a model", ""
+
+    monkeypatch.setattr(colmap_poses, "reconstruct", reconstruct)
+    monkeypatch.setattr(colmap_poses, "load", lambda _: "a model")
+    monkeypatch.setattr(Case, "items", lambda _: items)
+    commits = []
+    for resume in (False, False, True):
+        _, origins = baselines.solve_case("room", tmp_path, resume)
+        commits.append([origin.commit for origin in origins])
+        for file in tmp_path.rglob("*.asked"):
+            file.write_text(json.dumps({**json.loads(file.read_text()), "commit": "abc1234"}))
+    assert len(solved) == 2
+    assert commits[2] == ["abc1234"] != commits[1]
 
 
 def test_colmap_s_time_is_without_its_start_and_without_reading(
