@@ -28,6 +28,7 @@ from launch.graph import Graph, Replaced, build_graph
 from launch.named_input import quoted
 from launch.refusal import GraphError
 from launch.settings import Settings
+from launch.settings_file import absolute
 from nodes.parameters import did_you_mean, parameter_names, plain_values
 
 CONF = Path(__file__).resolve().parent / "conf"
@@ -87,6 +88,9 @@ def _at_home(value: Any) -> Any:
         return [_at_home(item) for item in value]
     # os.path's raises nothing where a user has no home
     return os.path.expanduser(value) if isinstance(value, str) and value.startswith("~/") else value  # noqa: PTH111
+
+
+OmegaConf.register_new_resolver("absolute", lambda path: absolute(_at_home(path)), replace=True)  # ${absolute:PATH}
 
 
 def prepare(overrides: Sequence[str], conf: Path = CONF, *, all_choices_known: bool = True) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ def lasting(graph: Graph) -> dict[str, Any]:
     found = dict(graph.resolved)
     for source in graph.sources:
         if graph.slots[source].node.replayable:
-            found[source] = {key: _found(value) if key in FILES else value for key, value in found[source].items()}
+            found[source] = {key: absolute(value) if key in FILES else value for key, value in found[source].items()}
     return found
 
 
@@ -33,6 +34,7 @@ def write_settings(file: Path, config: Mapping[str, Any], command: str) -> None:
         aside.write_text(f"# {without_passwords(' '.join(command.split()))}\n{settings}", encoding="utf-8")
 
 
-def _found(value: Any) -> Any:
-    there = isinstance(value, str) and value != "" and Path(value).exists()
+def absolute(value: Any) -> Any:
+    """The path of a file or folder that is there, as any directory finds it; else the value as it is."""
+    there = isinstance(value, str) and value != "" and os.path.exists(value)  # noqa: PTH110  # raises nothing
     return str(Path(value).absolute()) if there else value

@@ -43,8 +43,7 @@ def checks() -> Iterator[tuple[str, str, bool]]:
     yield "system", f"{platform.system()} {platform.release()} {platform.machine()}", True
     yield "processor", *_processor()
     yield "memory", f"{memory.available / 1e9:.1f} of {memory.total / 1e9:.1f} GB free", memory.available > 2e9
-    free = shutil.disk_usage(tempfile.gettempdir()).free
-    yield "disk", f"{free / 1e9:.1f} GB free in {tempfile.gettempdir()}", free > 1e9
+    yield "disk", *_disk()
     yield from _kernels()
     yield "gpu", *_gpu()
     for name in NEEDED:
@@ -102,6 +101,15 @@ def _processor() -> tuple[str, bool]:
         return str(error), False
 
 
+def _disk() -> tuple[str, bool]:
+    try:
+        folder = tempfile.gettempdir()
+    except FileNotFoundError as error:  # of all that it tries
+        return f"no folder takes temporary files: free some room, or set TMPDIR to a folder ({error.strerror})", False
+    free = shutil.disk_usage(folder).free
+    return f"{free / 1e9:.1f} GB free in {folder}", free > 1e9
+
+
 def _kernels() -> Iterator[tuple[str, str, bool]]:
     loaded = {}
     for name in KERNELS:
@@ -145,8 +153,11 @@ def main(arguments: list[str] | None = None, prog: str = "mvsgs doctor") -> int:
         print(f"{'' if right else '! '}{name:{30 if right else 28}} {found}", flush=True)
     if not options.no_test:
         print(f"{'self-test':30} ", end="", flush=True)
-        with tempfile.TemporaryDirectory() as folder:
-            reached, right = self_test(Path(folder))
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                reached, right = self_test(Path(folder))
+        except OSError as error:
+            reached, right = f"cannot be made: {error.strerror or error}", False
         wrong += [] if right else ["self-test"]
         print(reached if right else f"! {reached}")
     print(f"to be looked at: {', '.join(wrong)}" if wrong else "all is well")

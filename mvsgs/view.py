@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import viser
 
-from mvsgs.view_tools import Cropping, Exporting, Flight, Measuring
+from mvsgs.view_tools import Cropping, Exporting, Flight, Measuring, Newest
 from mvsgs_core.camera import resize_image, scale_intrinsics
 from mvsgs_core.evaluation.ground_plane import ground_axes, up_direction
 from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.cameras import Cameras
-from mvsgs_core.export.command_line import input_arguments, known_cameras, read_map, run
+from mvsgs_core.export.command_line import input_arguments, known_cameras, lens, read_map, run
 from mvsgs_core.export.keyframe_render import rendered_keyframe
 from mvsgs_core.export.ply import folded
 from mvsgs_core.export.snapshot import Snapshot
@@ -33,16 +33,21 @@ from nodes.seen_keyframes import goodness
 
 FIGURES = ("coverage", "error")  # that can color keyframes
 _POINTS = 20000  # of the depth of the keyframe that is shown
-_UNKNOWN = np.array([900.0, 900.0, 639.5, 359.5]), (720, 1280)  # camera of a flight where the map's is not known
+_UNKNOWN = np.array([900.0, 900.0, 639.5, 359.5]), (720, 1280)  # camera of videos where nobody says it
 
 
 class SavedMapView:
     """The page of one saved map. `closed` is set by its button."""
 
-    def __init__(self, page: MapPage, final: Snapshot, cameras: Cameras | None, photographs: Path, name: str) -> None:
-        """photographs: folder with the keyframes' images, or one that is not there."""
+    def __init__(
+        self, page: MapPage, final: Snapshot, cameras: Cameras | None, photographs: Path, name: str,
+        camera: tuple[np.ndarray, tuple[int, int]] = _UNKNOWN,
+    ) -> None:  # fmt: skip
+        """photographs: folder with the keyframes' images, or one that is not there; camera: intrinsics (4,) and size
+        (height, width) of videos."""
         self.page, self.closed = page, threading.Event()
-        self._showing = threading.Lock()
+        drawing = threading.Lock()
+        self._showing, self._tinting = Newest(self._show, drawing), Newest(self._tint, drawing)
         self._final, self._cameras, self._photographs = final, cameras, photographs
         self._left = final  # of the map, where it is cropped
         gui, splats = page.server.gui, final.splats
@@ -59,7 +64,7 @@ class SavedMapView:
             gui.add_markdown("There is no cameras.json beside this map, so that its keyframes are not known.")
         else:
             self._show_keyframes(cameras)
-        self._add_tools()
+        self._add_tools(*camera)
         gui.add_button("Close").on_click(lambda _: self.closed.set())
         if cameras is not None:
             self.pictures = KeyframePictures(gui)
@@ -69,20 +74,19 @@ class SavedMapView:
         splats = folded(final.splats, final.kernel)  # browsers know only Gaussians
         return self.page.show_splats(**gaussian_arrays(splats))
 
-    def _add_tools(self) -> None:
+    def _add_tools(self, intrinsics: np.ndarray, size: tuple[int, int]) -> None:
         rotations = self._poses[:, :3, :3] if len(self._poses) else np.eye(3)[None]
         axes = np.concatenate([ground_axes(rotations), up_direction(rotations)[None]])
         self.cropping = Cropping(self.page, self._final, axes, self._cropped)
         self.measuring = Measuring(self.page, lambda: self._left)
-        intrinsics, size = _UNKNOWN if self._cameras is None else _lens(self._cameras)
-        self.flight = Flight(self.page, lambda: self._left, intrinsics, size, self._poses)
+        self.flight = Flight(self.page, lambda: self._left, intrinsics, size, self._poses, self.closed)
         self.exporting = Exporting(self.page, lambda: self._left, lambda: self.measuring.ruler.factor, self._cameras)
 
     def _cropped(self, left: Snapshot) -> None:
         self._left = left
         self._show_splats(left)
         if self._cameras is not None:
-            self.show(self._shown)
+            self._showing()
 
     def _show_keyframes(self, cameras: Cameras) -> None:
         for k, index in enumerate(cameras.keyframes.tolist()):
@@ -91,27 +95,25 @@ class SavedMapView:
         self.page.show_path()
         gui, last = self.page.server.gui, len(cameras) - 1
         self._figure = gui.add_dropdown("color keyframes by", ("nothing", *FIGURES), initial_value="nothing")
-        self._figure.on_update(lambda _: self.tint(str(self._figure.value)))
+        self._figure.on_update(self._tinting.moved)
         if last > 0:
             self._slider: viser.GuiInputHandle[int] = gui.add_slider("keyframe", 0, last, 1, 0)
-            self._slider.on_update(lambda _: self.show(int(self._slider.value)))
+            self._slider.on_update(self._showing.moved)
         self._caption = gui.add_markdown("")
         gui.add_button("Look from here").on_click(self._look)
 
     def _choose(self, k: int, _: Any) -> None:
-        if len(self._poses) > 1:
-            self._slider.value = k  # type: ignore[misc]  # viser's setter; it shows the keyframe
-        else:
-            self.show(k)
+        self.show(k)
 
     def show(self, k: int) -> None:
         """Keyframe number k, from 0: its frustum is marked, its pictures are beside the scene."""
-        with self._showing:  # the page calls from threads
-            self._show(k)
+        if len(self._poses) > 1:
+            self._slider.value = k  # type: ignore[misc]  # viser's setter
+        self._showing()
 
-    def _show(self, k: int) -> None:
+    def _show(self) -> None:
         assert self._cameras is not None
-        self._shown = k
+        self._shown = k = int(self._slider.value) if len(self._poses) > 1 else 0
         index, (height, width) = int(self._cameras.keyframes[k]), self._cameras.sizes[k].tolist()
         self.page.mark(index)
         photograph = keyframe_images.known_image(self._photographs, index)
@@ -129,18 +131,23 @@ class SavedMapView:
 
     def tint(self, figure: str) -> None:
         """Colors all keyframes by "coverage", or by the "error" of those with a photograph; or by "nothing"."""
+        self._figure.value = figure  # type: ignore[misc]  # viser's setter
+        self._tinting()
+
+    def _tint(self) -> None:
         assert self._cameras is not None
-        found = {}
-        with self._showing:
-            for k in range(len(self._cameras)) if figure in FIGURES else ():
-                index, small = int(self._cameras.keyframes[k]), _small(self._cameras, k)
-                render, depth = self._rendered(small, 0)
-                if figure == "coverage":
-                    found[index] = float((depth > 0).mean())
-                elif (photograph := keyframe_images.known_image(self._photographs, index)) is not None:
-                    size = (int(small.sizes[0, 0]), int(small.sizes[0, 1]))
-                    found[index] = goodness(float(difference(render, resize_image(photograph, size)).mean()))
-            self.page.tint(found)
+        found, figure = {}, str(self._figure.value)
+        for k in range(len(self._cameras)) if figure in FIGURES else ():
+            if self.closed.is_set():
+                return
+            index, small = int(self._cameras.keyframes[k]), _small(self._cameras, k)
+            render, depth = self._rendered(small, 0)
+            if figure == "coverage":
+                found[index] = float((depth > 0).mean())
+            elif (photograph := keyframe_images.known_image(self._photographs, index)) is not None:
+                size = (int(small.sizes[0, 0]), int(small.sizes[0, 1]))
+                found[index] = goodness(float(difference(render, resize_image(photograph, size)).mean()))
+        self.page.tint(found)
 
     def _look(self, event: Any) -> None:
         client: viser.ClientHandle | None = event.client
@@ -154,11 +161,6 @@ def _small(cameras: Cameras, k: int, width: int = 160) -> Cameras:
     size = (max(1, round(height * min(width, full) / full)), min(width, full))
     intrinsics = scale_intrinsics(cameras.intrinsics[k], (height, full), size)
     return replace(cameras.chosen(slice(k, k + 1)), intrinsics=intrinsics[None], sizes=np.array([size]))
-
-
-def _lens(cameras: Cameras) -> tuple[np.ndarray, tuple[int, int]]:
-    """Intrinsics (4,) and size (height, width) of the newest keyframe."""
-    return cameras.intrinsics[-1], (int(cameras.sizes[-1, 0]), int(cameras.sizes[-1, 1]))
 
 
 def _span(depths: np.ndarray) -> str:
@@ -183,14 +185,19 @@ def view(options: argparse.Namespace) -> str:
     if not len(final.splats):
         raise ValueError(f"{options.map} has no splats: there is nothing to show")
     cameras = known_cameras(options)
+    said = cameras is not None or options.size is not None or options.intrinsics is not None
+    camera = lens(options) if said else _UNKNOWN
     with contextlib.redirect_stdout(io.StringIO()):  # viser's own banner
         page = MapPage(options.host, options.port, options.name)
-    shown = SavedMapView(page, final, cameras, options.map.with_name(keyframe_images.FOLDER), str(options.map))
+    photographs = options.map.with_name(keyframe_images.FOLDER)
+    shown = SavedMapView(page, final, cameras, photographs, str(options.map), camera)
     print(f"{options.map}: {page.url}{left_out}; the page's button Close or Ctrl-C ends it", flush=True)
     signal.signal(signal.SIGINT, lambda *_: shown.closed.set())
     shown.closed.wait()
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Python waits for what the page's threads still do
     page.server.stop()
-    return f"{options.map}: closed"
+    exporting = "; the export that is being made is waited for, a further Ctrl-C ends it"
+    return f"{options.map}: closed{exporting if shown.exporting.writing.locked() else ''}"
 
 
 def main(arguments: list[str] | None = None, prog: str = "mvsgs view") -> int:

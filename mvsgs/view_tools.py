@@ -16,6 +16,7 @@ import numpy as np
 import viser
 
 from mvsgs_core.export.cameras import Cameras
+from mvsgs_core.export.command_line import FAILURES, why
 from mvsgs_core.export.mesh import write_mesh
 from mvsgs_core.export.picking import Box, Ruler, hit, kept
 from mvsgs_core.export.ply import write_ply
@@ -31,6 +32,40 @@ FPS = 30.0
 VOXEL = 0.01  # of the mesh, in median depths
 FORMATS = (".ply", *WRITERS, ".glb")
 AXES = ("left to right", "front to back", "bottom to top")
+
+
+class Newest:
+    """Does a work one call at a time, whatever threads the page calls from. A call is left out where another one waits:
+    what that reads as it begins is the newest."""
+
+    def __init__(self, work: Callable[[], None], working: threading.Lock | None = None) -> None:
+        """working: held meanwhile; works that share one wait for each other."""
+        self._work, self._working, self._waiting = work, working or threading.Lock(), threading.Lock()
+
+    def __call__(self) -> None:
+        if self._waiting.acquire(blocking=False):
+            with self._working:
+                self._waiting.release()
+                self._work()
+
+    def moved(self, event: Any) -> None:
+        """A call for what a hand changed in the page; who changes it from here calls by himself."""
+        if event.client is not None:
+            self()
+
+
+def send(client: viser.ClientHandle, name: str, said: viser.GuiMarkdownHandle, write: Callable[[Path], str]) -> None:
+    """Gives one who looks at the page a file of that name. `said` is what `write` returns, or why there is no file."""
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / name
+            told = write(file)
+            client.send_file_download(name, file.read_bytes())
+        said.content = told
+    except InterruptedError:
+        pass  # the page was closed: nobody is there to be told
+    except FAILURES as error:
+        said.content = escaped(why(error))
 
 
 class Measuring:
@@ -89,30 +124,30 @@ class Cropping:
         """axes: (3, 3) right, ahead and up of the scene; changed: called with what is left."""
         self._final, self._changed = final, changed
         self.box = Box.around(final.splats.means.numpy(), axes)
-        self.left = final
+        self._cropping = Newest(self._crop)
         gui = page.server.gui
         with gui.add_folder("crop", expand_by_default=False):
             self._sides = [gui.add_multi_slider(name, 0, 100, 1, (0, 100)) for name in AXES]
             self.said = gui.add_markdown("")
             gui.add_button("All of it").on_click(lambda _: self.crop(np.tile([0.0, 100.0], (3, 1))))
         for side in self._sides:
-            side.on_update(self._moved)
-
-    def _moved(self, event: Any) -> None:
-        if event.client is not None:
-            self.crop(np.array([side.value for side in self._sides], dtype=float))
+            side.on_update(self._cropping.moved)
 
     def crop(self, percent: np.ndarray) -> None:
-        """To (3, 2) percent of the extent along each axis; nothing at all is refused."""
+        """To (3, 2) whole percent of the extent along each axis; nothing at all is refused."""
+        for side, (low, high) in zip(self._sides, percent.round().astype(int).tolist()):
+            side.value = (low, high)  # type: ignore[misc]  # viser's setter
+        self._cropping()
+
+    def _crop(self) -> None:
+        percent = np.array([side.value for side in self._sides], dtype=float)
         chosen = self.box.inside(self._final.splats.means.numpy(), percent)
         if not chosen.any():
             self.said.content = "Nothing would be left."
             return
-        for side, (low, high) in zip(self._sides, percent.round().astype(int).tolist()):
-            side.value = (low, high)  # type: ignore[misc]  # viser's setter
-        self.left = self._final if chosen.all() else kept(self._final, chosen)
-        self.said.content = f"{len(self.left.splats)} of {len(self._final.splats)} splats"
-        self._changed(self.left)
+        left = self._final if chosen.all() else kept(self._final, chosen)
+        self.said.content = f"{len(left.splats)} of {len(self._final.splats)} splats"
+        self._changed(left)
 
 
 class Flight:
@@ -120,12 +155,13 @@ class Flight:
 
     def __init__(
         self, page: MapPage, shown: Callable[[], Snapshot], intrinsics: np.ndarray, size: tuple[int, int],
-        keyframes: np.ndarray,
+        keyframes: np.ndarray, closed: threading.Event,
     ) -> None:  # fmt: skip
-        """The camera's intrinsics (4,) and size (height, width); keyframes (K, 4, 4) relative to the map's origin."""
+        """The camera's intrinsics (4,) and size (height, width); keyframes (K, 4, 4) relative to the map's origin;
+        closed: ends what is being rendered."""
         self.poses: list[np.ndarray] = []
         self._page, self._shown, self._intrinsics, self._size = page, shown, intrinsics, size
-        self._rendering = threading.Lock()
+        self._rendering, self._closed = threading.Lock(), closed
         gui = page.server.gui
         with gui.add_folder("path", expand_by_default=False):
             gui.add_button("Add this view").on_click(self._add_view)
@@ -160,17 +196,16 @@ class Flight:
         if event.client is None or not self._rendering.acquire(blocking=False):
             return
         try:
-            with tempfile.TemporaryDirectory() as folder:
-                count = self.render(Path(folder) / "flight.mp4", float(self._seconds.value))
-                event.client.send_file_download("flight.mp4", (Path(folder) / "flight.mp4").read_bytes())
-            self.said.content = f"{count} frames at {FPS:g} a second: flight.mp4"
-        except (ValueError, OSError) as error:
-            self.said.content = escaped(str(error))
+            send(event.client, "flight.mp4", self.said, self._write)
         finally:
             self._rendering.release()
 
+    def _write(self, file: Path) -> str:
+        return f"{self.render(file, float(self._seconds.value))} frames at {FPS:g} a second: {file.name}"
+
     def render(self, file: Path, seconds: float) -> int:
-        """Writes the video, H.264; returns its frames. Raises OSError, and ValueError for less than two views."""
+        """Writes the video, H.264; returns its frames. Raises OSError, also as the page is closed, and ValueError for
+        less than two views."""
         if len(self.poses) < 2:
             raise ValueError("a path has two views or more")
         final = self._shown()
@@ -179,6 +214,8 @@ class Flight:
 
         def frames() -> Any:
             for k, frame in enumerate(frames_along(final, path, self._intrinsics, self._size)):
+                if self._closed.is_set():
+                    raise InterruptedError("the page was closed")
                 if k % 10 == 0:
                     self.said.content = f"frame {k} of {len(path)}"
                 yield frame
@@ -193,6 +230,7 @@ class Exporting:
         self, page: MapPage, shown: Callable[[], Snapshot], factor: Callable[[], float], cameras: Cameras | None
     ) -> None:
         self._shown, self._factor, self._cameras = shown, factor, cameras
+        self.writing = threading.Lock()  # one file at a time
         gui = page.server.gui
         with gui.add_folder("export", expand_by_default=False):
             formats = FORMATS if cameras is not None else FORMATS[:-1]
@@ -201,16 +239,13 @@ class Exporting:
             self.said = gui.add_markdown("")
 
     def _download(self, event: viser.GuiEvent[Any]) -> None:
-        if event.client is None:
-            return
-        try:
-            with tempfile.TemporaryDirectory() as folder:
-                file = Path(folder) / f"map{self._format.value}"
-                self.write(file)
-                event.client.send_file_download(file.name, file.read_bytes())
-                self.said.content = self.said_of(file)
-        except (ValueError, OSError) as error:
-            self.said.content = escaped(str(error))
+        if event.client is not None:
+            with self.writing:
+                send(event.client, f"map{self._format.value}", self.said, self._write)
+
+    def _write(self, file: Path) -> str:
+        self.write(file)
+        return self.said_of(file)
 
     def said_of(self, file: Path) -> str:
         """What a user should know of a file that was written."""
@@ -219,7 +254,8 @@ class Exporting:
         return f"{file.name}: {file.stat().st_size} bytes{told}"
 
     def write(self, file: Path) -> None:
-        """In the format of its suffix, for any viewer. Raises ValueError for one that there is not, OSError."""
+        """In the format of its suffix, for any viewer. Raises ValueError for one that there is not, OSError, and
+        ImportError where there is no open3d for a mesh."""
         factor = self._factor()
         final = self._shown().scaled(factor)
         if file.suffix == ".glb" and self._cameras is not None:
@@ -234,4 +270,4 @@ class Exporting:
             raise ValueError(f"no format {file.suffix!r} here")
 
 
-__all__ = ["Cropping", "Exporting", "Flight", "Measuring"]
+__all__ = ["Cropping", "Exporting", "Flight", "Measuring", "Newest"]

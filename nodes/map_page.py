@@ -12,7 +12,7 @@ import numpy as np
 import viser
 
 from mvsgs_core.geometry import quaternion_from_rotation
-from nodes.page_guard import guarded
+from nodes.page_guard import guarded, in_address
 
 _PATH_COLOR = (230, 90, 40)
 _PLAIN_COLOR, _MARKED_COLOR = (90, 110, 140), (230, 90, 40)
@@ -51,7 +51,7 @@ class MapPage:
         check_address(host, port)
         with guarded(host, names):
             self.server = viser.ViserServer(host=host, port=port, label="MVS-GS", verbose=False)
-        self.url = f"http://{host}:{self.server.get_port()}"
+        self.url = f"http://{in_address(host)}:{self.server.get_port()}"
         self.unit: float | None = None  # map units in one unit of the page
         self.splats: viser.GaussianSplatHandle | None = None
         self.path: viser.LineSegmentsHandle | None = None

@@ -23,6 +23,11 @@ _PORTS = {"http": 80, "https": 443}  # of an address that names none
 _ADVICE = "give the name at which a proxy shows it: viewer.names=[NAME], or `mvsgs view --name NAME`"
 
 
+def in_address(host: str) -> str:
+    """A host as it stands in the address of a page: one of IPv6 in brackets."""
+    return f"[{host}]" if ":" in host else host
+
+
 def check_names(names: Sequence[str], option: str) -> None:
     """Raises ValueError for what can be no name of a host."""
     for name in names:
@@ -80,7 +85,8 @@ def refusal(headers: Headers, host: str, names: Sequence[str] = ()) -> str | Non
     known = {name.lower() for name in names}
     name, _ = _place(f"//{asked}")
     if is_loopback(host) and not is_loopback(name) and name not in known:  # else a name of another's that leads here
-        return f"it is at {host}, and was asked for at {asked!r}: open it at http://{host} or localhost, or {_ADVICE}"
+        place = f"http://{in_address(host)}"
+        return f"it is at {host}, and was asked for at {asked!r}: open it at {place} or localhost, or {_ADVICE}"
     if origin is None or _place(origin)[0] in known or _same_place(origin, asked):
         return None
     return f"a page of {origin!r} asked for it, at {asked!r}; if that is its own, {_ADVICE}"

@@ -15,10 +15,12 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from launch.comparison import compared, comparison_text, names
+from launch.compose import compose
+from launch.named_input import quoted
 from mvsgs.compare import main as compare
 from mvsgs.evaluate import main as evaluate
 from mvsgs_core.evaluation import metrics
-from mvsgs_core.evaluation.common_frames import different, seconds_of
+from mvsgs_core.evaluation.common_frames import different, one_input, seconds_of
 from mvsgs_core.evaluation.metrics import Figure
 from mvsgs_core.evaluation.side_by_side import chosen
 from mvsgs_core.export.cameras import read_cameras, write_cameras
@@ -138,6 +140,49 @@ def test_runs_of_other_inputs_or_sizes_are_said_to_be_so(
         assert ("do not compare" in shown) == ("do not compare" in page) == bool(said)
         assert ('class="better"' in page) == (not said)
         assert ("These runs have no keyframe in common." not in page) == common
+
+
+@pytest.mark.parametrize("name", ["walk.mp4", "a walk, (1) 'of' 5.mp4", "photos"])
+def test_an_input_is_the_same_however_it_is_named(
+    name: str, runs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    home = tmp_path / "home"
+    file = home / name
+    file.mkdir(parents=True)
+    (tmp_path / "link").symlink_to(home)
+    monkeypatch.chdir(home)
+    monkeypatch.setenv("HOME", str(home))
+    words = [name, f"./{name}", f"{name}/", f"~/{name}", str(file), f"../home/{name}", str(tmp_path / "link" / name)]
+    found = []
+    for word in words:
+        graph = compose(["dataset=images", f"dataset.path={quoted(word)}"])
+        assert graph.slots["dataset"].config["path"] in (word, str(file))  # as it was given, but for the home
+        found.append(graph.slots["evaluator"].config["input"])
+    assert found[:5] == [f"images {file}"] * 5
+    monkeypatch.chdir("/")
+    for text in found:
+        for run, given in zip(runs, (f"images {file}", text)):
+            with_report(run, input=given)
+        assert compare([*map(str, runs)]) == 0
+        assert "different inputs" not in capsys.readouterr().out, text
+    monkeypatch.chdir(home)  # as the reports of earlier versions have them
+    assert one_input([{"input": f"images {word}"} for word in words if word[0] != "~"])
+    assert one_input([{"input": name}, {"input": str(file)}])
+    assert not one_input([{"input": f"images {name}"}, {"input": "images elsewhere"}])
+
+
+@pytest.mark.parametrize(
+    ("words", "given"),
+    [
+        (["dataset=camera", "dataset.path='0'"], " 0"),
+        (["dataset=camera", "dataset.path='rtsp://me:word@host/a?b=c,d'"], " rtsp://me:word@host/a?b=c,d"),
+        (["dataset=camera", f"dataset.path=rtsp://host/{'a' * 5000}"], f" rtsp://host/{'a' * 5000}"),
+        (["dataset=synthetic"], "synthetic "),
+        (["dataset=tum", "dataset.path=gone/walk"], "tum gone/walk"),
+    ],
+)
+def test_an_input_that_is_no_file_is_named_as_it_was(words: list[str], given: str) -> None:
+    assert compose(words).slots["evaluator"].config["input"] == given
 
 
 def test_the_error_is_against_a_photograph_of_the_same_size(runs: list[Path], tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -58,6 +59,21 @@ def test_an_open3d_that_does_not_load_is_said(
     said = capsys.readouterr().out
     assert "for meshes: open3d does not load (libEGL.so.1): sudo apt install libegl1" in said
     assert said.endswith("to be looked at: open3d\n")
+
+
+def test_a_disk_that_takes_no_file_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", None)  # what was found before
+    monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: [str(tmp_path / "gone")])
+    assert doctor.main([]) == 1
+    said = capsys.readouterr().out
+    assert "! disk                         no folder takes temporary files: free some room, or set TMPDIR to a" in said
+    assert said.count("\nweights ") == len(weights.REGISTRY)
+    assert (
+        f"self-test                      ! cannot be made: No usable temporary directory found in ['{tmp_path}" in said
+    )
+    assert said.endswith("to be looked at: disk, self-test\n")
 
 
 @pytest.mark.slow

@@ -53,6 +53,16 @@ def test_a_name_that_leads_here_gets_nothing(opened: MapPage) -> None:
         connection.close()
 
 
+def test_an_address_of_ipv6_is_one_that_a_browser_opens() -> None:
+    map_page = MapPage("::1", free_port())
+    try:
+        assert map_page.url == f"http://[::1]:{map_page.server.get_port()}"
+        assert "ReplayDone" in page(map_page.url)
+    finally:
+        map_page.server.stop()
+    assert "open it at http://[::1] or localhost, or" in str(refusal(Headers(Host="evil.example"), "::1"))
+
+
 def test_who_opens_it_to_the_network_may_be_asked_by_any_name_but_by_no_other_page() -> None:
     for name in ("robot.local:8080", "192.168.1.5:8080", "[fe80::1]:8080"):
         assert refusal(Headers(Host=name), "0.0.0.0") is None

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from nodes.evaluator import Evaluator
 from tests.support.chromium import Browser, browser
 from tests.support.evaluated_wall import feed, wall_evaluator
 
@@ -91,3 +93,19 @@ def test_what_it_says(page: Browser, report: str) -> None:
     ):  # fmt: skip
         assert said in text, said
     assert page.evaluate("document.querySelectorAll('.scale').length") >= 2
+
+
+@pytest.mark.parametrize(
+    ("given", "title"),
+    [
+        ("video /data/a walk/over the hill.mp4", "video over the hill.mp4"),
+        ("/data/recording.mcap", "recording.mcap"),
+        ("camera rtsp://host/2", "camera rtsp://host/2"),
+        ("tum ../walk", "tum ../walk"),
+    ],
+)
+def test_the_title_has_the_inputs_name_and_the_table_where_it_is(given: str, title: str, tmp_path: Path) -> None:
+    list(Evaluator(Evaluator.Config(output=str(tmp_path), lpips="off", input=given)).on_end())
+    document = (tmp_path / "report.html").read_text()
+    assert f": {title}</h1>" in document
+    assert f"<td>input</td><td>{given}</td>" in document

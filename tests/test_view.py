@@ -10,20 +10,23 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from mvsgs import view
 from mvsgs.view import SavedMapView
+from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.export.cameras import read_cameras
 from mvsgs_core.export.keyframe_images import write_image
 from mvsgs_core.export.ply import read_ply
 from nodes.map_page import MapPage, escaped
 from tests.support.ports import free_port
 from tests.support.shared_data import ROOT
-from tests.support.tiny_map import SIZE, write_tiny_run
+from tests.support.tiny_map import INTRINSICS, SIZE, write_tiny_run
 from tests.support.viewer_page import page
 
 
@@ -109,25 +112,91 @@ def test_a_map_of_another_program_is_shown_without_keyframes(tmp_path: Path) -> 
     assert "no cameras.json beside this map" in got
 
 
-@pytest.mark.slow
-def test_the_command_says_where_the_page_is_and_ends_by_ctrl_c(tmp_path: Path) -> None:
-    run = write_tiny_run(tmp_path / "run")
-    code = "import sys; from mvsgs.command import main; sys.exit(main())"
+@contextmanager
+def started(run: Path, code: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A process that shows the map of a run, and where: what it says first."""
     process = subprocess.Popen(
         [sys.executable, "-c", code, "view", str(run), "--port", str(free_port())],
-        stdout=subprocess.PIPE, text=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE, text=True, cwd=run.parent, env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     try:
         assert process.stdout is not None
         said = process.stdout.readline()
         assert said.startswith(f"{run / 'map.ply'}: http://127.0.0.1:")
-        assert "/splats" in page(said.split()[1].rstrip(";"))
         time.sleep(0.1)
-        process.send_signal(signal.SIGINT)
-        assert process.wait(10) == 0
+        yield process, said
     finally:
         process.kill()
         process.communicate()
+
+
+@pytest.mark.slow
+def test_the_command_says_where_the_page_is_and_ends_by_ctrl_c(tmp_path: Path) -> None:
+    run = write_tiny_run(tmp_path / "run")
+    with started(run, "import sys; from mvsgs.command import main; sys.exit(main())") as (process, said):
+        assert "/splats" in page(said.split()[1].rstrip(";"))
+        process.send_signal(signal.SIGINT)
+        assert process.wait(10) == 0
+
+
+EXPORTING = """
+import sys, time
+from mvsgs import view
+from mvsgs.command import main
+
+class Exporting(view.SavedMapView):
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.exporting.write = lambda file: time.sleep(120)
+        self.page.server._thread_executor.submit(self.exporting._download, EVENT)
+
+class EVENT:
+    client = "somebody"
+
+view.SavedMapView = Exporting
+sys.exit(main())
+"""
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_it_at_once_where_an_export_is_waited_for(tmp_path: Path) -> None:
+    run = write_tiny_run(tmp_path / "run")
+    with started(run, EXPORTING) as (process, _):
+        process.send_signal(signal.SIGINT)
+        assert process.stdout is not None
+        said = "closed; the export that is being made is waited for, a further Ctrl-C ends it"
+        assert f"{run / 'map.ply'}: {said}\n" in (process.stdout.readline(), process.stdout.readline())  # viser's, too
+        process.send_signal(signal.SIGINT)
+        assert process.wait(10) == -signal.SIGINT
+
+
+def test_the_camera_of_videos_is_the_one_that_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = write_tiny_run(tmp_path / "run")
+    words = [str(run), "--port", str(free_port()), "--size", "48", "64"]
+    found = []
+
+    def closed(*arguments: Any) -> SavedMapView:
+        shown = SavedMapView(*arguments)
+        shown.closed.set()
+        found.append((shown.flight._intrinsics.tolist(), shown.flight._size))
+        return shown
+
+    monkeypatch.setattr(view, "SavedMapView", closed)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    assert view.main(words) == 0
+    (run / "cameras.json").unlink()
+    assert view.main([*words, "--intrinsics", "50", "51", "32", "24"]) == 0
+    assert view.main(words[:-3]) == 0
+    assert [size for _, size in found] == [(48, 64), (48, 64), (720, 1280)]
+    np.testing.assert_allclose(found[0][0], scale_intrinsics(INTRINSICS, SIZE, (48, 64)))
+    assert found[1][0] == [50.0, 51.0, 32.0, 24.0]
+
+
+def test_a_camera_that_is_given_by_half_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = write_tiny_run(tmp_path / "run")
+    (run / "cameras.json").unlink()
+    assert view.main([str(run), "--size", "48", "64"]) == 1
+    assert "give it with --cameras, or its --intrinsics and --size" in capsys.readouterr().err
 
 
 def test_what_cannot_be_shown_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

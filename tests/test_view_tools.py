@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import html
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import av
 import numpy as np
 import pytest
 import torch
 
+from mvsgs import view_tools
 from mvsgs.view import SavedMapView
+from mvsgs_core.export import picking
 from mvsgs_core.export.cameras import read_cameras
 from mvsgs_core.export.ply import folded, read_ply, write_ply
 from nodes.map_page import MapPage
 from tests.support.ports import free_port
-from tests.support.tiny_map import SIZE, final_map, write_tiny_run
+from tests.support.tiny_map import INTRINSICS, SIZE, final_map, write_tiny_run
 
+BY_HAND = SimpleNamespace(client=SimpleNamespace(send_file_download=lambda name, content: None))  # an event
 HALF = np.array([[0.0, 50.0], [0.0, 100.0], [0.0, 100.0]])
 
 
@@ -24,7 +33,10 @@ HALF = np.array([[0.0, 50.0], [0.0, 100.0], [0.0, 100.0]])
 def shown(tmp_path: Path) -> Iterator[SavedMapView]:
     run = write_tiny_run(tmp_path / "run")
     opened = MapPage("127.0.0.1", free_port())
-    yield SavedMapView(opened, read_ply(run / "map.ply"), read_cameras(run / "cameras.json"), run / "keyframes", "tiny")
+    yield SavedMapView(
+        opened, read_ply(run / "map.ply"), read_cameras(run / "cameras.json"), run / "keyframes", "tiny",
+        (INTRINSICS, SIZE),
+    )  # fmt: skip
     opened.server.stop()
 
 
@@ -117,3 +129,97 @@ def test_keyframes_are_colored_by_what_the_map_covers(shown: SavedMapView) -> No
     assert len(set(colors)) == 2  # the last sees less of it
     shown.tint("nothing")
     assert shown.page.frustums[7].color == shown.page.frustums[14].color
+
+
+def dragged(slider: Any, values: list[Any], slow: Callable[[], None]) -> None:
+    """By a hand, as viser says it: each value is there before its event runs in a thread of a pool. The first event is
+    at work, `slow`, as the others come."""
+    with ThreadPoolExecutor(32) as pool:
+        for value in values:
+            slider._impl.value = value
+            done = [pool.submit(call, BY_HAND) for call in slider._impl.update_cb]
+            slow()
+            assert slider.value == value, "it is moved under the hand"
+    assert [call.result() for call in done] == [None] * len(done)
+    assert slider.value == values[-1]
+
+
+class Slow:
+    """A function that takes its time, how often it is called and by how many at once."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function, self._lock = function, threading.Lock()
+        self.calls = self.at_once = self.most = 0
+
+    def __call__(self, *arguments: Any) -> Any:
+        with self._lock:
+            self.calls, self.at_once = self.calls + 1, self.at_once + 1
+            self.most = max(self.most, self.at_once)
+        time.sleep(0.05 if self.calls % 2 else 0.15)  # who began first is not done first
+        found = self._function(*arguments)
+        with self._lock:
+            self.at_once -= 1
+        return found
+
+
+def test_a_crop_that_is_dragged_ends_where_the_hand_does(
+    shown: SavedMapView, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(view_tools, "kept", kept := Slow(picking.kept))
+    dragged(shown.cropping._sides[0], [(0, percent) for percent in range(99, 49, -1)], lambda: time.sleep(0.01))
+    assert kept.most == 1
+    assert kept.calls < 40
+    splats = shown.page.splats
+    assert splats is not None
+    seen = len(splats.centers)
+    shown.exporting.write(tmp_path / "map.ply")
+    assert len(read_ply(tmp_path / "map.ply").splats) == seen == len(shown._left.splats)
+    shown.cropping.crop(HALF)
+    assert len(splats.centers) == seen
+
+
+def test_keyframes_that_are_passed_over_are_not_rendered(shown: SavedMapView, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shown, "_rendered", rendered := Slow(shown._rendered))
+    dragged(shown._slider, [0, 1, 2] * 10 + [1], lambda: time.sleep(0.01))
+    assert rendered.most == 1
+    assert rendered.calls < 25
+    assert "keyframe **7**" in shown._caption.content
+    assert list(shown.page.points) == [7]
+    marked = shown.page.frustums[7].color
+    assert [shown.page.frustums[index].color == marked for index in (0, 7, 14)] == [False, True, False]
+
+
+def test_a_video_ends_as_the_page_is_closed(shown: SavedMapView, tmp_path: Path) -> None:
+    shown.flight.take(list(shown._poses))
+    with ThreadPoolExecutor(1) as pool:
+        done = pool.submit(shown.flight.render, tmp_path / "flight.mp4", 600.0)
+        end = time.monotonic() + 30
+        while "frame" not in shown.flight.said.content and time.monotonic() < end:
+            time.sleep(0.01)
+        shown.closed.set()
+        with pytest.raises(OSError, match="the page was closed"):
+            done.result(timeout=30)
+    assert list(tmp_path.glob("**/*.mp4")) == []
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (ImportError("open3d does not load: sudo apt install libegl1"), "sudo apt install libegl1"),
+        (MemoryError("of the field"), "not enough memory: of the field"),
+        (OSError("no space left"), "no space left"),
+    ],
+)
+def test_why_there_is_no_file_is_said_in_the_page(
+    shown: SavedMapView, error: Exception, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_: Any, **__: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(view_tools, "write_mesh", failing)
+    monkeypatch.setattr(view_tools, "write_video", failing)
+    shown.exporting._format.value = ".glb"  # type: ignore[misc]
+    shown.flight.take(list(shown._poses))
+    for tool in (shown.exporting, shown.flight):
+        tool._download(BY_HAND)  # type: ignore[arg-type]
+        assert said in html.unescape(tool.said.content)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -49,7 +50,17 @@ def different(reports: Sequence[Mapping[str, Any]], times: Sequence[Times]) -> s
 
 
 def one_input(reports: Sequence[Mapping[str, Any]]) -> bool:
-    return not _several([report.get("input") for report in reports])
+    return not _several([_input(report) for report in reports])
+
+
+def _input(report: Mapping[str, Any]) -> str | None:
+    """As the report names it; a file or folder that is there by its one real path, however it was named."""
+    named: str | None = report.get("input")
+    if named is None:
+        return None
+    paths = named, named.partition(" ")[2]  # alone, or behind the name of a data set
+    found = next((path for path in paths if os.path.exists(path)), "")  # noqa: PTH110  # raises nothing
+    return named.removesuffix(found) + os.path.realpath(found) if found else named
 
 
 def _several(values: Sequence[Any]) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any, NamedTuple
@@ -185,7 +186,7 @@ def page(
     memory = {node: f"{size / 1e6:.0f} MB" for node, size in report.get("memory", {}).get("peak_bytes", {}).items()}
     left_out = skipped.in_words(report.get("skipped", {}))
     warnings = sorted_warnings(report)
-    named = str(report.get("input") or "")
+    named = re.sub("(^| )/.*/", r"\1", str(report.get("input") or ""))  # without the folders
     body = [
         f"<h1>{escape(f'{title}: {named}' if named else title)}</h1>",
         f'<div class="run">{figures_table(in_words(report))}</div>',

@@ -18,6 +18,13 @@ from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.trajectory_file import read_trajectory
 
+FAILURES = (ValueError, OSError, ImportError, MemoryError)  # that are said to a user, who can mend them
+
+
+def why(error: BaseException) -> str:
+    """One of FAILURES in a line."""
+    return f"not enough memory: {error}".removesuffix(": ") if isinstance(error, MemoryError) else str(error)
+
 
 def run(
     parser: argparse.ArgumentParser, arguments: list[str] | None, command: Callable[[argparse.Namespace], str]
@@ -26,9 +33,8 @@ def run(
     options = parser.parse_args(arguments)
     try:
         print(command(options))
-    except (ValueError, OSError, ImportError, MemoryError) as error:
-        said = f"not enough memory: {error}".removesuffix(": ") if isinstance(error, MemoryError) else error
-        print(f"{parser.prog.replace('.', ' ').split()[-1]}: {said}", file=sys.stderr)
+    except FAILURES as error:
+        print(f"{parser.prog.replace('.', ' ').split()[-1]}: {why(error)}", file=sys.stderr)
         return 1
     return 0
 
