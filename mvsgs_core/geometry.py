@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # the axes of a camera; its own inverse
+FARTHEST = 1e100  # in any unit: what lies beyond is no position
 _STILL = 1e-9  # of a position's magnitude: two that are nearer are the same
 
 
@@ -28,8 +29,9 @@ def rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
 
 
 def is_rigid(pose: np.ndarray) -> bool:
-    """Whether (4, 4) is a rotation and a position, up to the rounding of who wrote it down."""
-    if not np.isfinite(pose).all():
+    """Whether (4, 4) is a rotation and a position, up to the rounding of who wrote it down; squares of the latter can
+    be taken."""
+    if not np.abs(pose[:3, 3]).max() < FARTHEST or not np.isfinite(pose).all():
         return False
     rotation = pose[:3, :3]
     if np.abs(rotation).max() > 2.0 or not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]):

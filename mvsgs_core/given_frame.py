@@ -49,6 +49,8 @@ def given_frame(world_from_cam: np.ndarray, given: np.ndarray) -> GivenFrame:
     if len(given) < FEWEST:
         raise NoFrameError(f"{len(given)} frames of the map came with a pose, {FEWEST} are needed")
     source, target = world_from_cam[:, :3, 3], given[:, :3, 3]
+    if not np.abs(target).max() < geometry.FARTHEST:
+        raise NoFrameError("some are no positions")
     if not (geometry.moves(source) and geometry.moves(target)):
         raise NoFrameError("their positions coincide")
     if _turn_otherwise(world_from_cam[:, :3, :3], given[:, :3, :3]):

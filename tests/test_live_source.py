@@ -59,12 +59,13 @@ def test_the_original_image_is_the_one_that_comes_whatever_its_sender_says() -> 
     assert frame.original_intrinsics.tolist() == came.tolist()
 
 
-def test_a_pose_that_comes_with_a_frame_goes_apart_from_it_and_one_that_is_none_is_left_out() -> None:
+@pytest.mark.parametrize("wrong", [2.0 * np.eye(4), np.full((4, 4), np.nan), np.eye(4) + 1e200 * np.eye(4, k=3)])
+def test_a_pose_that_comes_with_a_frame_goes_apart_from_it_and_one_that_is_none_is_left_out(wrong: np.ndarray) -> None:
     node, pose = Brief(Brief.Config(stop=2)), np.eye(4)
     pose[:3, 3] = [1.0, 2.0, 3.0]
     image, lens = np.zeros((24, 32, 3), np.uint8), np.array([25.0, 25, 15.5, 11.5])
     node.comes = lambda number: Frame(
-        0, float(number), image + np.uint8(number), lens, world_from_cam=pose if number == 1 else 2.0 * pose
+        0, float(number), image + np.uint8(number), lens, world_from_cam=pose if number == 1 else wrong
     )
     sent = list(node.run())
     assert [message.world_from_cam for message in sent if isinstance(message, Frame)] == [None, None]

@@ -135,9 +135,10 @@ def _pose(transform: Any) -> np.ndarray | None:
     position = np.array([moved.x, moved.y, moved.z], np.float64)
     quaternion = np.array([turned.w, turned.x, turned.y, turned.z], np.float64)
     length = float(np.linalg.norm(quaternion))
-    if not (np.isfinite(position).all() and 0.99 < length < 1.01):
+    if not 0.99 < length < 1.01:
         return None
-    return geometry.rigid(geometry.rotation_from_quaternion(quaternion / length), position)
+    pose = geometry.rigid(geometry.rotation_from_quaternion(quaternion / length), position)
+    return pose if geometry.is_rigid(pose) else None
 
 
 __all__ = ["MOVING", "STATIC", "TOPICS", "TransformTree"]

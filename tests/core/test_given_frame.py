@@ -59,6 +59,11 @@ def test_what_tells_no_frame_is_refused_and_says_why() -> None:
         given_frame(poses, np.repeat(given[:1], len(poses), axis=0))
     with pytest.raises(NoFrameError, match=r"turn otherwise than the camera.*not of what carries it"):
         given_frame(poses, given @ np.linalg.inv(BODY_FROM_CAMERA))
+    for size in (1e120, 1e300):
+        far = given.copy()
+        far[:, :3, 3] *= size
+        with pytest.raises(NoFrameError, match="no positions"):
+            given_frame(poses, far)
     elsewhere = given.copy()
     elsewhere[:, :3, 3] = 100.0 * np.random.default_rng(0).normal(size=(len(poses), 3))
     with pytest.raises(NoFrameError):

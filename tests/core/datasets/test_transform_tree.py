@@ -86,7 +86,7 @@ def test_what_is_no_transform_is_left_out_and_a_circle_ends() -> None:
     wrong = [transform("a", "b", 1.0, pose(0, 0, 0, 0, 0, 0)) for _ in range(3)]
     wrong[0].transform.rotation.w = float("nan")
     wrong[1].transform.rotation.w = 3.0
-    wrong[2].transform.translation.x = float("inf")
+    wrong[2].transform.translation.x = 1e200
     tree.add(message(*wrong, transform("a", "a", 1.0, np.eye(4)), transform("", "b", 1.0, np.eye(4))), static=False)
     assert (tree.refused, tree.frames) == (5, [])
     tree.add(message(transform("a", "b", 1.0, np.eye(4)), transform("b", "a", 1.0, np.eye(4))), static=False)
