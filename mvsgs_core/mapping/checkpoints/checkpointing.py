@@ -122,7 +122,11 @@ class Checkpointing:
             self._writer.submit(atlas.frozen(), results=False)  # they are there, with the camera that took the stream
         self._writer.wait()
         if keep and mapped:
-            self._writer.keep_newest()
+            try:
+                self._writer.keep_newest()
+            except OSError as error:  # the map is there, and a checkpoint more than needs to be
+                why = error.strerror or str(error)
+                atlas.current.log.warn(f"earlier checkpoints cannot be removed from {self._output / FOLDER}: {why}")
         self._pass_problems_on(atlas.current.log)
         if not mapped:
             shutil.rmtree(self._output / FOLDER, ignore_errors=True)

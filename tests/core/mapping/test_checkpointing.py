@@ -285,6 +285,24 @@ def test_the_checkpoint_of_a_finished_map_is_made_where_wanted(tmp_path: Path) -
     assert read_source_camera(tmp_path / "cameras.json") == source
 
 
+def test_earlier_checkpoints_that_cannot_be_removed_cost_no_map(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    atlas = begun(PLAIN)
+    checkpoints = Checkpointing(tmp_path, 30.0, atlas, clock=Clock())
+    assert times(checkpoints, atlas) == 1
+
+    def refused(self: CheckpointWriter) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(CheckpointWriter, "keep_newest", refused)
+    checkpoints.close(atlas, keep=True)
+    said = f"earlier checkpoints cannot be removed from {tmp_path / FOLDER}: Read-only file system"
+    assert said in atlas.current.log.warnings
+    assert len(state_files(tmp_path)) == 2
+    assert checkpoint_info(tmp_path).file == state_files(tmp_path)[0]
+
+
 def test_a_copy_that_is_written_is_let_go(tmp_path: Path) -> None:
     checkpoints, copy = CheckpointWriter(tmp_path, PLAIN), begun(PLAIN).frozen()
     written = weakref.ref(copy)
