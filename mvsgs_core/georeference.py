@@ -20,8 +20,9 @@ from mvsgs_core import geodesy, geometry
 from mvsgs_core.atomic_file import replace_text
 from mvsgs_core.bad_file import reading
 from mvsgs_core.geometry import Similarity
+from mvsgs_core.similarity_file import read_similarity, write_similarity
 
-FORMAT, VERSION = "mvsgs georeference", 1
+FORMAT = "mvsgs georeference"
 FILE = "georeference.json"
 FIGURES = ("residual", "farthest", "scale_deviation", "angle_deviation", "position_deviation")
 FEWEST = 4  # positions that agree: three always do
@@ -211,8 +212,7 @@ def values_of(found: Georeference) -> dict[str, Any]:
 def write_georeference(path: Path, found: Georeference) -> None:
     """Replaces `path` atomically. Raises OSError."""
     said = "metres east, north and up of the origin (WGS84) = scale * rotation * position in map.ply + translation"
-    content = {"format": FORMAT, "version": VERSION, "frame": said, **values_of(found)}
-    replace_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+    write_similarity(path, FORMAT, said, values_of(found))
 
 
 def write_origin(path: Path, found: Georeference, axes: str) -> None:
@@ -227,23 +227,14 @@ def write_origin(path: Path, found: Georeference, axes: str) -> None:
 
 def read_georeference(path: Path) -> Georeference:
     """What `write_georeference` wrote. Raises BadFileError, saying what is wrong with it, and OSError."""
+    content, place = read_similarity(path, FORMAT)
     with reading(path, f"is no {FILE} of this program"):
-        content = json.loads(path.read_text(encoding="ascii"))
-        if content["format"] != FORMAT or content["version"] != VERSION:
-            raise ValueError(f"{content['format']!r} of version {content['version']!r}: version {VERSION} is read")
         origin = np.array([content["origin"][name] for name in ("latitude", "longitude", "altitude")], np.float64)
-        rotation, translation = (np.array(content[name], np.float64) for name in ("rotation", "translation"))
         if not geodesy.is_place(origin):
             raise ValueError("its origin is no place")
-        if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
-            raise ValueError("its rotation is none")
-        if translation.shape != (3,) or not np.isfinite(translation).all():
-            raise ValueError("its translation is no three finite numbers")
-        if not 0.0 < float(content["scale"]) < math.inf:
-            raise ValueError("its scale is not positive")
         figures = {name: float(content[name]) for name in FIGURES}
         return Georeference(
-            origin=origin, scale=float(content["scale"]), rotation=rotation, translation=translation,
+            origin=origin, scale=place.scale, rotation=place.rotation, translation=place.translation,
             positions=int(content["positions"]), outliers=int(content["outliers"]),
             camera_up=bool(content["camera_up"]), **figures,
         )  # fmt: skip

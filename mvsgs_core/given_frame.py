@@ -3,8 +3,6 @@ that was made without them lies in it."""
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from mvsgs_core import geometry
-from mvsgs_core.atomic_file import replace_text
 from mvsgs_core.bad_file import reading
 from mvsgs_core.geometry import Similarity
+from mvsgs_core.similarity_file import read_similarity, write_similarity
 
-FORMAT, VERSION = "mvsgs given frame", 1
+FORMAT = "mvsgs given frame"
 FILE = "given_frame.json"
 FEWEST = 3  # poses
 ROUNDS = 5
@@ -113,24 +111,13 @@ def in_words(found: Mapping[str, Any]) -> dict[str, str]:
 def write_given_frame(path: Path, found: GivenFrame) -> None:
     """Replaces `path` atomically. Raises OSError."""
     said = "position as poses were given = scale * rotation * position in map.ply + translation"
-    content = {"format": FORMAT, "version": VERSION, "frame": said, **values_of(found)}
-    replace_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+    write_similarity(path, FORMAT, said, values_of(found))
 
 
 def read_given_frame(path: Path) -> GivenFrame:
     """What `write_given_frame` wrote. Raises BadFileError, saying what is wrong with it, and OSError."""
+    content, place = read_similarity(path, FORMAT)
     with reading(path, f"is no {FILE} of this program"):
-        content = json.loads(path.read_text(encoding="ascii"))
-        if content["format"] != FORMAT or content["version"] != VERSION:
-            raise ValueError(f"{content['format']!r} of version {content['version']!r}: version {VERSION} is read")
-        rotation, translation = (np.array(content[name], np.float64) for name in ("rotation", "translation"))
-        if rotation.shape != (3, 3) or translation.shape != (3,):
-            raise ValueError("its rotation or translation is none")
-        if not geometry.is_rigid(geometry.rigid(rotation, translation)):
-            raise ValueError("its rotation and translation are none")
-        if not 0.0 < float(content["scale"]) < math.inf:
-            raise ValueError("its scale is not positive")
-        place = Similarity(float(content["scale"]), rotation, translation)
         return GivenFrame(place, int(content["poses"]), float(content["distance"]), float(content["angle"]))
 
 

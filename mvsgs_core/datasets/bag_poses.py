@@ -14,6 +14,7 @@ from mvsgs_core.datasets.transform_tree import STATIC, TOPICS, TransformTree
 if TYPE_CHECKING:
     from mvsgs_core.datasets.bag_file import OpenBag
 
+ROUNDING = 1000  # ns by which a stamp may be off that is held in seconds: float64 has steps of 240 since 1970
 _TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
@@ -25,7 +26,9 @@ class BagPoses:
 
     def at(self, seconds: float, notices: Notices) -> np.ndarray | None:
         """(4, 4) world_from_cam of an image with this stamp; None, counted in `notices`, where /tf does not tell."""
-        pose = self._tree.pose(self._camera, self._world, round(1e9 * seconds))
+        time = round(1e9 * seconds)
+        near = (self._tree.pose(self._camera, self._world, time + off) for off in (0, -ROUNDING, ROUNDING))
+        pose = next((pose for pose in near if pose is not None), None)
         if pose is None:
             what = f"images without a pose, as /tf does not say where {self._camera} was in {self._world} then"
             notices.tally(what, f"{seconds:.3f} s")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,10 @@ from rosbags.typesys import get_types_from_msg
 
 from mvsgs_core import geometry
 from mvsgs_core.datasets import open_dataset
+from mvsgs_core.datasets.bag_poses import BagPoses
+from mvsgs_core.datasets.ros import seconds_of
+from mvsgs_core.datasets.sequence import Notices
+from mvsgs_core.datasets.transform_tree import TransformTree
 from tests.support.bag_messages import WIDTH, Messages, picture
 
 TF = "tf2_msgs/msg/TFMessage"
@@ -83,3 +88,19 @@ def test_frames_that_are_not_there_are_named(tmp_path: Path, ros: Messages) -> N
     ros.write(bare, [("/c/image_raw", 2.0, ros.image(0, "rgb8", picture(0), 3 * WIDTH))])
     with pytest.raises(ValueError, match=r"fixed_frame=odom: the bag has no /tf"):
         open_dataset("bag", path=str(bare), fixed_frame="odom")
+
+
+def test_the_last_image_has_a_pose_of_its_own_time_after_which_no_transform_comes() -> None:
+    """Stamps of images are held in seconds, whose steps are some hundred nanoseconds today."""
+    still = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
+    tree, notices = TransformTree(), Notices()
+    for nanoseconds in [0, *sorted(np.random.default_rng(0).integers(1, 10**9, 20).tolist())]:
+        stamp = SimpleNamespace(sec=1_764_460_800, nanosec=nanoseconds)
+        told = SimpleNamespace(
+            header=SimpleNamespace(stamp=stamp, frame_id="odom"), child_frame_id="camera",
+            transform=SimpleNamespace(translation=still, rotation=still),
+        )  # fmt: skip
+        tree.add(SimpleNamespace(transforms=[told]), static=False)
+        if nanoseconds > 0:  # after a first one
+            assert BagPoses(tree, "camera", "odom").at(seconds_of(told, 0), notices) is not None
+    assert not notices
